@@ -16,15 +16,36 @@ from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
 from trustbo.statespace.blocks import LinearPredictor
 
-_CHUNK = 32  # largest number of points evaluated at once
-_NUMBERS = 5_000_000  # largest number of precision entries of the points evaluated at once
-_CHAINED = 100  # missions from which lasting effects are eliminated as chains
-_FEW = 15  # missions with which the search for the mode begins
-_SIZES = (0.3, 1.0, 1.8, 2.6)  # log ratios of the sd of rates to the noises at each start
-_LARGEST_NOISE, _LEAST_NOISE = 50.0, 1e-6  # limits of the size of the noises; see `NormalScores`
-SWEEPS = 1  # EP sweeps at each point, beginning with the sites at the mode
-_SETTLED, _DAMPING = 12, 0.7  # EP sweeps and damping to find the sites at the mode
-_DEVIATIONS = 4  # draws of the coefficients that are kept at each visited point
+_CHUNK = 32
+"""Largest number of points evaluated at once."""
+_NUMBERS = 5_000_000
+"""Largest number of precision entries of the points evaluated at once."""
+_CHAINED = 100
+"""Number of missions from which lasting effects are eliminated as chains."""
+_FEW = 15
+"""Number of missions with which the search for the mode begins."""
+_SIZES = (0.3, 1.0, 1.8, 2.6)
+"""Log ratios of the sd of rates to the noises at each start of the search."""
+_USUAL_NOISE = 0.2
+"""Scale of the default priors of the noises, to which the sd of rates is compared."""
+_SPREADS = (1e-2, 3.0)
+"""Limits of the ratio of the sd of rates to the usual noise."""
+_LARGEST_NOISE = 50.0
+"""Largest size of the noises whose density is computed; see `NormalScores`."""
+_LEAST_NOISE = 1e-6
+"""Least size of the noises whose density is computed."""
+SWEEPS = 1
+"""Number of EP sweeps at each point, beginning with the sites at the mode."""
+_SETTLED = 12
+"""Number of EP sweeps that find the sites at the mode."""
+_DAMPING = 0.7
+"""Damping of the EP sweeps that find the sites at the mode."""
+_DEVIATIONS = 4
+"""Number of draws of the coefficients that are kept at each visited point."""
+_WIDER = 1.5
+"""Factor on the covariance of the core scores in the defensive proposal."""
+_PRIOR_VARIANCE = 1.2
+"""Variance of the other scores in the defensive proposal; a priori, it is 1."""
 
 
 class Draws(NamedTuple):
@@ -59,6 +80,7 @@ class Columns(NamedTuple):
         """
         unit = rng.standard_normal((len(index), self.deviation.shape[1]))
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+
         drawn = self.mean[index]
         for point in np.unique(index):
             here = index == point
@@ -71,19 +93,23 @@ class Density:
 
     def __init__(self, model: TrustModel, observations: Observations) -> None:
         """Prepare the columns and blocks of a model for the observations."""
-        self.model, self.observations = model, observations
+        self.model = model
+        self.observations = observations
         self.evaluated: Callable[[int], object] = lambda n: None  # called with numbers of points
         self.layout = model.layout(observations)
         self.scores = model.scores(observations)
         self.n_scores = self.scores.n_scores
+
         columns = [effect.columns(observations) for effect in model.columns]
         self.ends = np.cumsum([0, *(U.shape[1] for U in columns)])
         self._U = self.layout.columns(sparse.hstack(columns, format="csr"))
         self.exact = model.family.gaussian
         self._chained = self.exact and observations.n_missions >= _CHAINED
+
         y = self.layout.rows(observations.contact_rate)
-        apart, order = not self.exact, self._order()
-        self.blocks = Blocks.of(y, self._U, self.layout.label, apart=apart, order=order)
+        self.blocks = Blocks.of(
+            y, self._U, self.layout.label, apart=not self.exact, order=self._order()
+        )
         if not self.exact:
             self.terms = ep.Terms(model.family, y, self.layout.rows(observations.n_ticks))
             self.reset_ep()
@@ -95,13 +121,20 @@ class Density:
 
     def _order(self) -> Order:
         """Find the order in which the columns are eliminated; see `Order`."""
-        n, (rows, p) = self.observations.n_missions, self._U.shape
+        n_missions = self.observations.n_missions
+        n_rows, n_columns = self._U.shape
+
+        # Which columns are independent a priori does not depend on theta, so any theta will do.
         prior = self._prior_of_fit(self.theta(np.zeros((1, self.n_scores))))
-        parts, chains = prior.parts, prior.chains
-        free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in parts])
-        at, met = self._U.tocoo(), np.zeros((n, p), dtype=bool)
-        met[at.row * n // rows, at.col] = True
-        return Order.of(met, free, 0 if chains is None else chains.lasting.shape[1])
+        free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in prior.parts])
+
+        # The rows of U are sorted by mission, equally many of each.
+        entries = self._U.tocoo()
+        met = np.zeros((n_missions, n_columns), dtype=bool)
+        met[entries.row * n_missions // n_rows, entries.col] = True
+
+        n_chains = 0 if prior.chains is None else prior.chains.lasting.shape[1]
+        return Order.of(met, free, n_chains)
 
     def without(self, mission: int) -> "Density":
         """Return the posterior without the data of one mission."""
@@ -119,35 +152,42 @@ class Density:
         """Compute the unnormalised log posterior density (point,) of scores (point, score)."""
         if namespace(z) is not np:
             return self.log_evidence(self.theta(z)) + self.scores.log_prior(z)
-        out = np.full(len(z), -np.inf)
+
+        log_p = np.full(len(z), -np.inf)
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
             theta, some = self._possible(z)
-            out[some] = self.log_evidence(theta) + self.scores.log_prior(z[some])
-        return np.where(np.isfinite(out), out, -np.inf)
+            log_p[some] = self.log_evidence(theta) + self.scores.log_prior(z[some])
+        return np.where(np.isfinite(log_p), log_p, -np.inf)
 
     def visit(self, z: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Columns]:
         """Compute the log density of scores, and the coefficients there, given Gaussian rates."""
-        n, p = len(z), self._U.shape[1]
-        log_p = np.full(n, -np.inf)
-        mean, deviation = np.zeros((n, p)), np.zeros((n, _DEVIATIONS, p))
-        with np.errstate(all="ignore"):
+        n_points = len(z)
+        n_columns = self._U.shape[1]
+        log_p = np.full(n_points, -np.inf)
+        mean = np.zeros((n_points, n_columns))
+        deviation = np.zeros((n_points, _DEVIATIONS, n_columns))
+
+        with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
             theta, some = self._possible(z)
             for where, chunk in chunks(theta, self._n_at_once):
                 fit, prior = self._fit(chunk)
                 log_p[some[where]] = fit.log_p
                 mean[some[where]], deviation[some[where]] = columns_of(prior, fit, _DEVIATIONS, rng)
             log_p[some] += self.scores.log_prior(z[some])
+
         return np.where(np.isfinite(log_p), log_p, -np.inf), Columns(mean, deviation)
 
     def _possible(self, z: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
         """Return the hyperparameters and the indices of scores whose density may be positive."""
-        theta, log_prior = self.theta(z), self.scores.log_prior(z)
+        theta = self.theta(z)
+        log_prior = self.scores.log_prior(z)
         size = np.exp(z[:, self.scores.noises])
         flat = [np.asarray(values).reshape(len(z), -1) for values in theta.values()]
 
         possible = np.isfinite(np.column_stack([*flat, log_prior])).all(1)
         possible &= ((size > _LEAST_NOISE) & (size < _LARGEST_NOISE)).all(1)
         possible &= (theta["inverse_gain"].reshape(len(z), -1) != 0.0).all(1)
+
         some = np.flatnonzero(possible)
         return at(theta, some), some
 
@@ -158,13 +198,15 @@ class Density:
             return gradient.log_evidence(
                 self.blocks, predictor, prior, self.site_precision(predictor)
             )
-        found = np.empty(len(theta["inverse_gain"]))
-        for i, chunk in chunks(theta, self._n_at_once):
+
+        log_p = np.empty(len(theta["inverse_gain"]))
+        for where, chunk in chunks(theta, self._n_at_once):
             if self.exact:
-                found[i] = self._fit(chunk)[0].log_p
+                fit, _ = self._fit(chunk)
+                log_p[where] = fit.log_p
             else:
-                found[i] = ep.log_evidence(self._joint(chunk), self.sites, SWEEPS)[0]
-        return found
+                log_p[where], _ = ep.log_evidence(self._joint(chunk), self.sites, SWEEPS)
+        return log_p
 
     def reset_ep(self) -> None:
         """Forget the EP sites, so that results do not depend on what was computed before."""
@@ -175,7 +217,8 @@ class Density:
         """Find the EP sites at the mean of theta, for use as initial sites at all other points."""
         if not self.exact:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
-            self.sites = ep.log_evidence(self._joint(center), self.sites, _SETTLED, _DAMPING)[1]
+            joint = self._joint(center)
+            _, self.sites = ep.log_evidence(joint, self.sites, _SETTLED, _DAMPING)
 
     def start(self) -> np.ndarray:
         """Return a start of the search for the mode or, with EP, the mode.
@@ -188,7 +231,9 @@ class Density:
             best = climb(of_few.log_density, of_few.start())
         else:
             best = self._best_of_four_starts()
+
         if not self.exact:
+            # The evidence by EP depends on the initial sites, which should be those at the mode.
             self.run_ep(self.theta(best[None]))
             best = climb(self.log_density, best)
             self.run_ep(self.theta(best[None]))
@@ -198,19 +243,25 @@ class Density:
         """Return the best of scores at which the noises have different sizes."""
         starts = np.zeros((len(_SIZES), self.n_scores))
         unit = self.model.family.line_of_sight[0]
-        spread = np.log(np.clip(unit * np.nanstd(self.observations.contact_rate) / 0.2, 1e-2, 3.0))
+        ratio = unit * np.nanstd(self.observations.contact_rate) / _USUAL_NOISE
+        spread = np.log(np.clip(ratio, *_SPREADS))
         starts[:, self.scores.noises] = spread - np.array(_SIZES)[:, None]
-        self.run_ep(self.theta(starts[1:2]))
+
+        self.run_ep(self.theta(starts[1:2]))  # sites of the second start suit all four
         return starts[self.log_density(starts).argmax()]
 
     def defensive(self, proposal: Student) -> Student:
         """Make a wider proposal for beta0, noises and sizes; other scores stay near the prior."""
         core = self.scores.core
         others = np.setdiff1d(np.arange(self.n_scores), core)
-        cov = 1.5 * proposal.scale @ proposal.scale.T
+
         center = proposal.center.copy()
-        cov[others], cov[:, others], center[others] = 0.0, 0.0, 0.0
-        cov[others, others] = 1.2
+        center[others] = 0.0
+
+        cov = _WIDER * proposal.scale @ proposal.scale.T
+        cov[others] = 0.0
+        cov[:, others] = 0.0
+        cov[others, others] = _PRIOR_VARIANCE
         return Student(center, np.linalg.cholesky(cov))
 
     def draw_by_ep(
@@ -219,7 +270,7 @@ class Density:
         """Draw coefficients and linear predictors once at each of the equally weighted points.
 
         Args:
-            z: NormalScores (point, score).
+            z: Normal scores (point, score).
             log_p: Log density (point,) of the scores by EP.
             rng: Random number generator.
             n_sweeps: Number of EP sweeps at each point.
@@ -227,11 +278,13 @@ class Density:
         Returns:
             The draws, and the log weights (point,) that correct the errors of EP.
         """
-        theta, parts = self.theta(z), []
+        theta = self.theta(z)
+        parts = []
         for _, chunk in chunks(theta):
             joint = self._joint(chunk)
-            sites = ep.log_evidence(joint, self.sites, n_sweeps)[1]
+            _, sites = ep.log_evidence(joint, self.sites, n_sweeps)
             parts.append(ep.draw(joint, sites, rng))
+
         c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
         return Draws(theta, c, f), log_weight + self.scores.log_prior(z) - log_p
 
@@ -250,33 +303,40 @@ class Density:
 
     def _prior_of_fit(self, theta: Theta) -> Prior:
         """Return the prior in the form that is fastest for computing the evidence."""
-        observations, groups, chains, first = self.observations, [], None, 0
+        n_missions = self.observations.n_missions
+        groups = []
+        chains = None
+        first = 0
         for effect, start in zip(self.model.columns, self.ends[:-1], strict=True):
-            found = effect.chains(theta, observations) if self._chained and chains is None else None
+            found = None
+            if self._chained and chains is None:  # `Order` has one group of hidden columns
+                found = effect.chains(theta, self.observations)
             if found is None:
-                groups.append(effect.prior(theta, observations))
+                groups.append(effect.prior(theta, self.observations))
                 continue
-            chains, first = found, int(start)
-            of_columns = namespace(chains.independent).repeat(
-                chains.independent, observations.n_missions, axis=1
-            )
+
+            chains = found
+            first = int(start)
+            xp = namespace(chains.independent)
+            of_columns = xp.repeat(chains.independent, n_missions, axis=1)
             groups.append((None, [of_columns]))
+
         prior = Prior.of(groups)
-        return (
-            prior if chains is None else prior.with_chains(chains, first, observations.n_missions)
-        )
+        if chains is None:
+            return prior
+        return prior.with_chains(chains, first, n_missions)
 
     def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence of Gaussian rates at each theta; also return the prior."""
         predictor, prior = self._at(theta)
-        return evidence(self.blocks, predictor, prior, self.site_precision(predictor)), prior
+        fit = evidence(self.blocks, predictor, prior, self.site_precision(predictor))
+        return fit, prior
 
     def _at(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
         """Return the distribution of the linear predictors and the prior at each theta."""
         self.evaluated(len(theta["inverse_gain"]))
-        return self.model.linear_predictor(
-            theta, self.observations, self.layout
-        ), self._prior_of_fit(theta)
+        predictor = self.model.linear_predictor(theta, self.observations, self.layout)
+        return predictor, self._prior_of_fit(theta)
 
     def site_precision(self, predictor: LinearPredictor) -> Any:
         """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured."""

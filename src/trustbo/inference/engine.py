@@ -60,31 +60,51 @@ class Blocks(NamedTuple):
             order: Order in which the columns are eliminated.
             apart: Whether each block is a separate kind, as needed if sites differ between blocks.
         """
-        n, p = len(y), U.shape[1]
-        inputs, U = U.shape[0] // n, sparse.csr_array(U)
+        n_blocks = len(y)
+        n_columns = U.shape[1]
+        n_inputs = U.shape[0] // n_blocks
+        U = sparse.csr_array(U)
+
+        # A row of `kinds` is a number that may keep blocks apart, the label, and the seen rows.
         seen = ~np.isnan(y)
-        kinds = np.column_stack([np.arange(n) if apart else np.zeros(n, dtype=int), label, seen])
-        kinds, kind = np.unique(kinds, axis=0, return_inverse=True)
+        number = np.arange(n_blocks) if apart else np.zeros(n_blocks, dtype=int)
+        kinds, kind = np.unique(np.column_stack([number, label, seen]), axis=0, return_inverse=True)
         kind = kind.ravel()
-        upper = np.triu_indices(inputs)
-        pair = np.zeros((inputs, inputs), dtype=int)
-        pair[upper] = pair.T[upper] = np.arange(len(upper[0]))
+
+        # Pairs of inputs are unordered, so that one number stands for (k, j) and for (j, k).
+        upper = np.triu_indices(n_inputs)
+        n_pairs = len(upper[0])
+        pair = np.zeros((n_inputs, n_inputs), dtype=int)
+        pair[upper] = pair.T[upper] = np.arange(n_pairs)
+
         entries, where, values = [], [], []
         for g in range(len(kinds)):
-            rows = (np.flatnonzero(kind == g)[:, None] * inputs + np.arange(inputs)).ravel()
-            X = sparse.csr_array(U[rows].reshape(len(rows) // inputs, inputs * p))
+            rows = (np.flatnonzero(kind == g)[:, None] * n_inputs + np.arange(n_inputs)).ravel()
+            X = sparse.csr_array(U[rows].reshape(len(rows) // n_inputs, n_inputs * n_columns))
             products = (X.T @ X).tocoo()
-            (k, a), (j, b) = np.divmod(products.row, p), np.divmod(products.col, p)
+
+            k, a = np.divmod(products.row, n_columns)  # input and column
+            j, b = np.divmod(products.col, n_columns)
             entry = order.entry(a, b)
-            entries.append(entry[entry >= 0])
-            where.append((g * len(upper[0]) + pair[k, j])[entry >= 0])
-            values.append(products.data[entry >= 0])
+            is_stored = entry >= 0
+            entries.append(entry[is_stored])
+            where.append((g * n_pairs + pair[k, j])[is_stored])
+            values.append(products.data[is_stored])
+
         at, row = np.unique(np.concatenate(entries), return_inverse=True)
-        shape = len(at), len(kinds) * len(upper[0])
         index = row, np.concatenate(where)
+        shape = len(at), len(kinds) * n_pairs
         sums = sparse.csr_array((np.concatenate(values), index), shape=shape)
-        seen_by_kind = kinds[:, 2:].astype(bool)
-        return cls(np.where(seen, y, 0.0), U, kind, kinds[:, 1], seen_by_kind, sums, at, order)
+        return cls(
+            y=np.where(seen, y, 0.0),
+            U=U,
+            kind=kind,
+            label=kinds[:, 1],
+            seen=kinds[:, 2:].astype(bool),
+            sums=sums,
+            at=at,
+            order=order,
+        )
 
 
 class Prior(NamedTuple):
@@ -99,36 +119,52 @@ class Prior(NamedTuple):
     @classmethod
     def of(cls, groups: Sequence[tuple[Any, Sequence[Any]]]) -> Self:
         """Combine groups of columns, each with a mean (point, k) or None and with precisions."""
-        means, parts, total, known = [], [], 0.0, {}
+        means = []
+        parts = []
+        log_det_of_all = 0.0
+        known = {}
         for mean, precisions in groups:
             if not precisions:
                 continue
-            n = sum(part.shape[1] for part in precisions)
-            means.append(np.zeros((len(precisions[0]), n)) if mean is None else mean)
+
+            n_columns = sum(part.shape[1] for part in precisions)
+            if mean is None:
+                mean = np.zeros((len(precisions[0]), n_columns))
+            means.append(mean)
+
             for part in precisions:
                 if id(part) not in known:  # robots often share one array
-                    xp = namespace(part)
-                    one_axis = part.ndim == 2
-                    known[id(part)] = xp.log(part).sum(1) if one_axis else log_det(part)
-                total = total + known[id(part)]
+                    is_diagonal = part.ndim == 2
+                    known[id(part)] = (
+                        namespace(part).log(part).sum(1) if is_diagonal else log_det(part)
+                    )
+                log_det_of_all = log_det_of_all + known[id(part)]
             parts.extend(precisions)
+
         xp = namespace(parts[0])
-        return cls(xp.concatenate(means, axis=1), parts, total)
+        return cls(xp.concatenate(means, axis=1), parts, log_det_of_all)
 
     def add_to(self, A: Any, order: Order) -> Any:
         """Add the prior precision to A (point, entry), the stored entries of precision matrices."""
         start = 0
         for part in self.parts:
-            i = np.arange(start, start := start + part.shape[1])
+            end = start + part.shape[1]
+            i = np.arange(start, end)
+            start = end
             if part.ndim == 2:
                 A = add(A, (slice(None), order.entry(i, i)), part)
             elif isinstance(A, np.ndarray):  # dependent columns are neighbours in the core
-                first, last = order.place[i[0]], order.place[i[-1]] + 1
-                order.views(A)[2][:, first:last, first:last] += part
+                _, _, C = order.views(A)
+                first = order.place[i[0]]
+                last = order.place[i[-1]] + 1
+                C[:, first:last, first:last] += part
             else:
                 a, b = np.triu_indices(len(i))
                 A = add(A, (slice(None), order.entry(i[a], i[b])), part[:, a, b])
-        return A if self.chains is None else self._add_chains(A, order)
+
+        if self.chains is None:
+            return A
+        return self._add_chains(A, order)
 
     def with_chains(self, chains: Chains, first: int, n_missions: int) -> Self:
         """Add hidden columns, the lasting parts of columns from `first`.
@@ -137,9 +173,11 @@ class Prior(NamedTuple):
         """
         xp = namespace(chains.lasting)
         n_chains = chains.lasting.shape[1]
-        log_det = n_missions * xp.log(chains.lasting).sum(1)
-        log_det = log_det - n_chains * (n_missions - 1) * np.log(1.0 - chains.rho**2)
-        return self._replace(log_det=self.log_det + log_det, chains=chains, first=first)
+
+        # A stationary AR(1) chain: the first state has the full variance, others 1 - rho^2 of it.
+        of_hidden = n_missions * xp.log(chains.lasting).sum(1)
+        of_hidden = of_hidden - n_chains * (n_missions - 1) * np.log(1.0 - chains.rho**2)
+        return self._replace(log_det=self.log_det + of_hidden, chains=chains, first=first)
 
     def _add_chains(self, A: Any, order: Order) -> Any:
         """Add the precision of the hidden columns s, and their coupling to the columns s + e."""
@@ -147,12 +185,15 @@ class Prior(NamedTuple):
         n_missions = len(order.hidden)
         s = order.hidden.T  # (chain, mission)
         total = self.first + np.arange(s.size).reshape(s.shape)
+
+        # The precision of an AR(1) chain is tridiagonal (Rue and Held 2005, chapter 1).
         inner = np.ones(n_missions)
         inner[1:-1] += rho**2
         tied = lasting[..., None] / (1.0 - rho**2)  # (point, chain, 1)
 
         coupling = order.entry(total, s)
         coupling = np.where(coupling < 0, order.entry(s, total), coupling)
+
         for entry, values in (
             (order.entry(s, s), independent[..., None] + tied * inner),
             (order.entry(s[:, :-1], s[:, 1:]), -rho * tied * np.ones(n_missions - 1)),
@@ -163,11 +204,16 @@ class Prior(NamedTuple):
 
     def log_density(self, c: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of coefficients (point, column)."""
-        start, off, square = 0, c - self.mean, 0.0
+        off = c - self.mean
+        start = 0
+        square = 0.0
         for part in self.parts:
-            x = off[:, start : (start := start + part.shape[1])]
+            end = start + part.shape[1]
+            x = off[:, start:end]
             weighted = part * x if part.ndim == 2 else (part @ x[..., None])[..., 0]
             square = square + (weighted * x).sum(1)
+            start = end
+
         return 0.5 * (self.log_det - c.shape[1] * np.log(2.0 * np.pi) - square)
 
     def draw(self, rng: np.random.Generator) -> np.ndarray:
@@ -205,18 +251,29 @@ def evidence(
         y: Site means (point, block, row), if different from the observations.
     """
     W, log_sites = whiten(blocks, predictor, lam)
-    xp, n, b = namespace(W), len(W), blocks
+    xp = namespace(W)
+    n = len(W)
+    b = blocks
+
+    # Regression of W (y - m) on C U with unit noise, where C = W T, about the prior mean.
     residual = (b.y if y is None else y) - expected(b, predictor, prior.mean)
     w = (W[:, b.kind] @ residual[..., None])[..., 0]
     C = W @ each(predictor.response, b.label)
+
+    # h = U' C' w; hidden columns do not occur in the data.
     back = (xp.swapaxes(C, 2, 3)[:, b.kind] @ w[..., None])[..., 0]
     h = times(b.U.T, back.reshape(n, -1))
     h = xp.concatenate([h, xp.zeros((n, b.order.hidden.size))], axis=1)
+
+    # A = U' C' C U + prior precision, from products of columns that do not depend on theta.
     pairs = (xp.swapaxes(C, 2, 3) @ C)[:, :, *np.triu_indices(C.shape[3])]
     A = add_products(xp.zeros((n, b.order.size)), b.at, b.sums, pairs.reshape(n, -1))
     A = prior.add_to(A, b.order)
-    many = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
-    log_p = log_sites @ many + 0.5 * (prior.log_det - (w**2).sum((1, 2)))
+
+    n_of_kind = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
+    log_p = log_sites @ n_of_kind + 0.5 * (prior.log_det - (w**2).sum((1, 2)))
+
+    # With A = F F', integrating over c adds h' A^-1 h / 2 = |F^-1 h|^2 / 2 and -log |F|.
     F = Factor.of(b.order, A)
     half = F.forward(h)
     return Fit(log_p + 0.5 * (half**2).sum(1) - F.log_det, F, half, W)
@@ -225,8 +282,10 @@ def evidence(
 def whiten(blocks: Blocks, predictor: LinearPredictor, lam: Any) -> tuple[Any, Any]:
     """Return whitening matrices W (point, kind, row, row) and log densities at zero residual."""
     V = each(predictor.covariance, blocks.label)
-    xp, some = namespace(V), lam > 0.0
+    xp = namespace(V)
+    some = lam > 0.0
     d = xp.where(some, xp.where(some, lam, 1.0) ** 0.5, 0.0)  # lam**0.5 has no slope at 0
+
     L = cholesky(np.eye(V.shape[-1]) + d[..., :, None] * V * d[..., None, :])
     log_sites = 0.5 * xp.log(xp.where(some, lam, 2.0 * np.pi) / (2.0 * np.pi)).sum(-1)
     return xp.linalg.inv(L) * d[..., None, :], log_sites - log_diagonal(L)
@@ -235,9 +294,10 @@ def whiten(blocks: Blocks, predictor: LinearPredictor, lam: Any) -> tuple[Any, A
 def expected(blocks: Blocks, predictor: LinearPredictor, c: Any) -> Any:
     """Compute the mean linear predictors (point, block, row) given coefficients (point, column)."""
     drift = times(blocks.U, c).reshape(len(c), len(blocks.y), -1)
-    xp, label = namespace(drift), blocks.label[blocks.kind]
-    if predictor.response.shape[1] == 1:
-        return each(predictor.mean, label) + drift @ xp.swapaxes(predictor.response[:, 0], 1, 2)
+    label = blocks.label[blocks.kind]
+    if predictor.response.shape[1] == 1:  # one product for all blocks is faster
+        response = namespace(drift).swapaxes(predictor.response[:, 0], 1, 2)
+        return each(predictor.mean, label) + drift @ response
     return each(predictor.mean, label) + (predictor.response[:, label] @ drift[..., None])[..., 0]
 
 
@@ -261,17 +321,27 @@ def marginals(
 
     Each block must be a separate kind (`apart` in `Blocks.of`), so that kind i is block i.
     """
-    V, T = each(predictor.covariance, blocks.label), each(predictor.response, blocks.label)
-    n, rows = len(V), V.shape[-1]
+    V = each(predictor.covariance, blocks.label)
+    T = each(predictor.response, blocks.label)
+    n_points = len(V)
+    n_blocks = len(blocks.y)
+    n_rows = V.shape[-1]
+    n_inputs = T.shape[3]
+
+    # Given c, the gain of a block is V (V + 1 / lam)^-1 = V W' W.
     c = prior.mean + fit.F.back(fit.half[:, None])[:, 0]
     gain = V @ (np.swapaxes(fit.W, 2, 3) @ fit.W)
-    G = T - gain @ T
     at = expected(blocks, predictor, c)
     mean = at + np.einsum("nbij,nbj->nbi", gain, y - at)
-    k, j = np.triu_indices(T.shape[3])
-    M = np.zeros((n, len(blocks.y), T.shape[3], T.shape[3]))  # U cov U' for each block
+
+    # M = U cov(c) U' of each block; `covariance` halves the diagonal, because M + M' adds it twice.
+    k, j = np.triu_indices(n_inputs)
+    M = np.zeros((n_points, n_blocks, n_inputs, n_inputs))
     pairs = times(blocks.sums.T, fit.F.covariance()[:, blocks.at])
-    M[..., k, j] = pairs.reshape(n, len(blocks.y), -1)
+    M[..., k, j] = pairs.reshape(n_points, n_blocks, -1)
     M = M + np.swapaxes(M, 2, 3)
+
+    # Law of total variance: given c, and of the mean given c, which is linear in c.
+    G = T - gain @ T
     var = np.diagonal(V, axis1=2, axis2=3) - (gain * V).sum(3) + ((G @ M) * G).sum(3)
-    return mean, np.broadcast_to(var, (n, len(blocks.y), rows))
+    return mean, np.broadcast_to(var, (n_points, n_blocks, n_rows))
