@@ -3,9 +3,9 @@
 Each likelihood term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites, `engine`
 computes the marginals of the linear predictors exactly. Dividing a marginal by its site gives the
 cavity. The site is then updated so that the product of the cavity and the site has the moments of
-the product of the cavity and the likelihood term. The log evidence is the log evidence of the sites
-plus, for each term, the log ratio of the masses of these products. Importance weights correct the
-draws.
+the product of the cavity and the likelihood term (Minka 2001; Rasmussen and Williams 2006, section
+3.6). The log evidence is the log evidence of the sites plus, for each term, the log ratio of the
+masses of these products. Importance weights correct the draws.
 """
 
 from typing import Any, NamedTuple
@@ -19,8 +19,20 @@ from trustbo.models.families import Family
 from trustbo.models.families.moments import log_normal
 from trustbo.statespace.blocks import LinearPredictor, each
 
-_LEAST = 1e-9  # smallest precision of a cavity or a site
-_TEMPERED = 0.6  # factor on the site precisions in the wider proposal
+_LEAST = 1e-9
+"""Smallest precision of a cavity or a site."""
+_LEAST_VARIANCE = 1e-12
+"""Smallest variance of a matched product."""
+_VAGUE_SD = 0.3
+"""Sd of trust, on the scale of rates, under which the initial sites are matched."""
+_USUAL_NOISE = 0.2
+"""Sd of the observation noise with which the initial sites are matched."""
+_TEMPERED = 0.6
+"""Factor on the site precisions in the wider proposal."""
+_LEAST_DEGREES = 8.0
+"""Smallest number of degrees of freedom of a proposal of coefficients."""
+_JITTER = 1e-12
+"""Added to the covariance of the predictors of a block."""
 
 
 class Terms(NamedTuple):
@@ -68,8 +80,10 @@ def first_sites(terms: Terms) -> Sites:
     """Make initial sites (1, block, row), matched under a vague distribution of trust."""
     unit, zero = terms.family.line_of_sight
     y = terms.y
-    m, v = np.full(y.shape, unit * (0.5 - zero)), np.full(y.shape, (0.3 * unit) ** 2)
-    noise = np.full(y.shape, 0.2)
+    m = np.full(y.shape, unit * (0.5 - zero))
+    v = np.full(y.shape, (_VAGUE_SD * unit) ** 2)
+    noise = np.full(y.shape, _USUAL_NOISE)
+
     _, mean, var = terms.family.match(y, terms.n_ticks, m, v, noise)
     return _matched(terms, 1.0 / v[None], m / v, mean, var)
 
@@ -80,31 +94,45 @@ def _matched(
     """Find the sites whose products with cavities N(slope / rest, 1 / rest) match mean and var."""
     seen = ~np.isnan(terms.y)
     lam = np.where(seen, np.maximum(1.0 / var - rest, _LEAST), 0.0)
-    return Sites(lam, np.where(seen, mean * (lam + rest) - slope, 0.0))
+    eta = np.where(seen, mean * (lam + rest) - slope, 0.0)
+    return Sites(lam, eta)
 
 
 def log_evidence(
     joint: Joint, sites: Sites, n_sweeps: int, damp: float = 1.0
 ) -> tuple[np.ndarray, Sites]:
-    """Compute the EP log evidence (point,) and the sites after `n_sweeps` sweeps."""
+    """Compute the EP log evidence (point,) and the sites after `n_sweeps` sweeps.
+
+    A sweep updates all sites at once (parallel EP). After the last, only the evidence is computed.
+    """
     blocks, predictor, prior, terms = joint
-    seen, sd = ~np.isnan(terms.y), predictor.noise_sd
+    seen = ~np.isnan(terms.y)
+    sd = predictor.noise_sd
     sites = sites.at(terms, sd)
-    total = np.zeros(len(sd))
+
+    log_p = np.zeros(len(sd))
     for sweep in range(n_sweeps + 1):
-        lam, eta, y = *sites, sites.y
+        lam, eta = sites
+        y = sites.y
         fit = evidence(blocks, predictor, prior, lam, y)
         mean, var = marginals(blocks, predictor, prior, fit, y)
-        rest = np.maximum(1.0 / var - lam, _LEAST)  # precision of the cavities
+
+        # Cavity: divide the marginal by its site (Rasmussen and Williams 2006, equation 3.56).
+        rest = np.maximum(1.0 / var - lam, _LEAST)
         slope = mean / var - eta
-        m, v = slope / rest, 1.0 / rest
+        m = slope / rest
+        v = 1.0 / rest
+
+        # Moments of the cavity times the likelihood term, and the log evidence (3.57 and 3.65).
         log_mass, mean, var = terms.family.match(terms.y, terms.n_ticks, m, v, sd)
-        total = fit.log_p + np.where(seen, log_mass - _overlap(y, lam, m, v), 0.0).sum((1, 2))
+        log_p = fit.log_p + np.where(seen, log_mass - _overlap(y, lam, m, v), 0.0).sum((1, 2))
+
+        # The site that gives these moments (3.59), damped.
         if sweep < n_sweeps:
-            new = _matched(terms, rest, slope, mean, np.maximum(var, 1e-12))
+            new = _matched(terms, rest, slope, mean, np.maximum(var, _LEAST_VARIANCE))
             sites = Sites(lam + damp * (new.lam - lam), eta + damp * (new.eta - eta))
             sites = sites.at(terms, sd)
-    return total, sites
+    return log_p, sites
 
 
 def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -127,19 +155,28 @@ def draw(
         (point,).
     """
     blocks, predictor, prior, terms = joint
-    n, p = len(predictor.noise_sd), blocks.U.shape[1]
-    nu = max(8.0, 2.0 * p)
+    n_points = len(predictor.noise_sd)
+    n_columns = blocks.U.shape[1]
+    nu = max(_LEAST_DEGREES, 2.0 * n_columns)
+
     proposals = []
     for share in (1.0, _TEMPERED):
-        share = np.where(terms.linear, 1.0, share)
-        lam, y = share * sites.lam, sites.y
-        fit = evidence(blocks, predictor, prior, lam, y)
-        proposals.append((prior.mean + fit.F.back(fit.half[:, None])[:, 0], fit.F))
-    wide, t = rng.random(n) < 0.5, rng.standard_normal((n, 1, proposals[0][1].size))
-    t /= np.sqrt(rng.chisquare(nu, (n, 1, 1)) / nu)
-    narrow, wider = (center + F.back(t)[:, 0] for center, F in proposals)
-    c = np.where(wide[:, None], wider, narrow)
-    log_q = np.logaddexp(*(_log_student(c, *one, nu) for one in proposals)) - np.log(2.0)  # pyright: ignore[reportCallIssue]
+        lam = np.where(terms.linear, 1.0, share) * sites.lam
+        fit = evidence(blocks, predictor, prior, lam, sites.y)
+        center = prior.mean + fit.F.back(fit.half[:, None])[:, 0]
+        proposals.append((center, fit.F))
+
+    is_wide = rng.random(n_points) < 0.5
+    _, F = proposals[0]
+    t = rng.standard_normal((n_points, 1, F.size))
+    t /= np.sqrt(rng.chisquare(nu, (n_points, 1, 1)) / nu)
+    narrow, wide = (center + F.back(t)[:, 0] for center, F in proposals)
+    c = np.where(is_wide[:, None], wide, narrow)
+
+    # Density of the mixture, whichever of its parts was drawn from.
+    of_narrow, of_wide = (_log_student(c, center, F, nu) for center, F in proposals)
+    log_q = np.logaddexp(of_narrow, of_wide) - np.log(2.0)
+
     f, log_block = draw_predictors(joint, expected(blocks, predictor, c), sites, rng)
     return c, f, prior.log_density(c) - log_q + log_block.sum(1)
 
@@ -156,39 +193,53 @@ def draw_predictors(
         rng: Random number generator.
 
     Returns:
-        Signals (draw, block, row) and log weights (draw, block). The mean weight is the likelihood
-        of a block given the coefficients.
+        Linear predictors (draw, block, row) and log weights (draw, block). The mean weight is the
+        likelihood of a block given the coefficients.
     """
     blocks, predictor, _, terms = joint
-    lam, eta, y = *sites, sites.y
+    lam, eta = sites
+    y = sites.y
     seen = ~np.isnan(terms.y)
+
+    # Normal distribution of the predictors of a block given its sites.
     W, log_sites = whiten(blocks, predictor, lam)
     V = each(predictor.covariance, blocks.label)
+    n_rows = V.shape[-1]
     gain = V @ (np.swapaxes(W, 2, 3) @ W)
     w = (W @ (y - at)[..., None])[..., 0]
     mean = at + (gain @ (y - at)[..., None])[..., 0]
     C = V - gain @ V
-    G = cholesky(0.5 * (C + np.swapaxes(C, 2, 3)) + 1e-12 * np.eye(V.shape[-1]))
-    sd = np.broadcast_to(predictor.noise_sd, (len(predictor.noise_sd), 1, V.shape[-1]))
-    f, e = np.zeros(mean.shape), np.zeros(mean.shape)
-    total = log_sites - 0.5 * (w**2).sum(2)
-    for k in range(V.shape[-1]):
-        a, d = mean[..., k] + (G[..., k, :k] * e[..., :k]).sum(-1), G[..., k, k]
+    G = cholesky(0.5 * (C + np.swapaxes(C, 2, 3)) + _JITTER * np.eye(n_rows))
+
+    sd = np.broadcast_to(predictor.noise_sd, (len(predictor.noise_sd), 1, n_rows))
+    f = np.zeros(mean.shape)
+    e = np.zeros(mean.shape)
+    log_weight = log_sites - 0.5 * (w**2).sum(2)
+    for k in range(n_rows):
+        # Given the rows before it, row k is N(a, d^2) with its own site, N(m, v) without.
+        a = mean[..., k] + (G[..., k, :k] * e[..., :k]).sum(-1)
+        d = G[..., k, k]
         d2 = np.broadcast_to(d**2, a.shape)
         rest = np.maximum(1.0 / d2 - lam[..., k], _LEAST)
-        m, v = (a / d2 - eta[..., k]) / rest, 1.0 / rest
-        of_row = terms.y[:, k], terms.n_ticks[:, k]
-        own, log_p = terms.family.draw(*of_row, m, v, sd[..., k], rng)
-        exact = ~seen[:, k] | terms.linear[:, k]
-        f[..., k] = np.where(exact, a + d * rng.standard_normal(a.shape), own)
-        total = total + np.where(exact, 0.0, log_p - _overlap(y[..., k], lam[..., k], m, v))
+        m = (a / d2 - eta[..., k]) / rest
+        v = 1.0 / rest
+
+        own, log_mass = terms.family.draw(terms.y[:, k], terms.n_ticks[:, k], m, v, sd[..., k], rng)
+        is_exact = ~seen[:, k] | terms.linear[:, k]
+        f[..., k] = np.where(is_exact, a + d * rng.standard_normal(a.shape), own)
         e[..., k] = (f[..., k] - a) / d
-    return f, total
+
+        # The likelihood replaces the site.
+        ratio = log_mass - _overlap(y[..., k], lam[..., k], m, v)
+        log_weight = log_weight + np.where(is_exact, 0.0, ratio)
+    return f, log_weight
 
 
 def _log_student(c: np.ndarray, center: np.ndarray, F: Factor, nu: float) -> np.ndarray:
     """Compute the log density of a Student-t distribution; F factors the precision matrix."""
-    p, z = c.shape[1], F.whitened(c - center)
+    p = c.shape[1]
+    z = F.whitened(c - center)
+
     constant: Any = special.gammaln(0.5 * (nu + p)) - special.gammaln(0.5 * nu)
     constant = constant - 0.5 * p * np.log(nu * np.pi)
     return constant + F.log_det - 0.5 * (nu + p) * np.log1p((z**2).sum(1) / nu)

@@ -27,7 +27,10 @@ from scipy.linalg import lapack
 from trustbo.kernels import kernel
 from trustbo.models.backend import inverse_and_log_det, inverse_from_factor, namespace
 
-_CHAIN_BLOCK = 30  # columns of a chain that are eliminated at once
+_CHAIN_BLOCK = 30
+"""Number of columns of a chain that are eliminated at once."""
+_DENSE = 20
+"""A sparse matrix with more than one entry in this many is multiplied as a dense one in JAX."""
 
 
 class Order(NamedTuple):
@@ -57,39 +60,55 @@ class Order(NamedTuple):
         hidden = len(free) + np.arange(n_missions * n_chains).reshape(n_missions, n_chains)
         met = np.hstack([met, np.repeat(np.eye(n_missions, dtype=bool), n_chains, axis=1)])
         free = np.append(free, np.zeros(hidden.size, dtype=bool))
-        alone = free & (met.sum(0) == 1) & (n_missions > 1)
-        only = np.where(alone, met.argmax(0), -1)
-        place = np.empty(len(only), dtype=int)
-        groups = [np.flatnonzero(only == j) for j in range(-1, n_missions)]
-        groups[0] = np.append(hidden.ravel(), np.setdiff1d(groups[0], hidden))
-        for columns in groups:
+        n_columns = len(free)
+
+        # A leaf is free and occurs in one mission; with one mission, nothing is gained by leaves.
+        is_leaf = free & (met.sum(0) == 1)
+        if n_missions == 1:
+            is_leaf[:] = False
+        only = np.where(is_leaf, met.argmax(0), -1)  # mission of each leaf
+        core = np.append(hidden.ravel(), np.setdiff1d(np.flatnonzero(only == -1), hidden))
+        leaves = [np.flatnonzero(only == j) for j in range(n_missions)]
+        leaves = [columns for columns in leaves if len(columns)]
+
+        place = np.empty(n_columns, dtype=int)
+        for columns in (core, *leaves):
             place[columns] = np.arange(len(columns))
-        groups = [groups[0], *(columns for columns in groups[1:] if len(columns))]
-        leaf = np.full((len(groups) - 1, max(map(len, groups[1:]), default=1)), len(only))
-        group = np.full(len(only), -1)
-        of_mission = [np.empty(0, dtype=int)]
-        for g, columns in enumerate(groups[1:]):
-            leaf[g, : len(columns)], group[columns] = columns, g
-            of_mission.append(np.flatnonzero(met[only[columns[0]], groups[0]]))
-        touched = np.full((len(leaf), max(map(len, of_mission))), len(groups[0]))
-        number = np.full((len(leaf), len(only)), -1)
-        for g, places in enumerate(of_mission[1:]):
+
+        leaf = np.full((len(leaves), max(map(len, leaves), default=1)), n_columns)
+        group = np.full(n_columns, -1)
+        touched_by = []  # places in the core of the columns that occur in each mission with leaves
+        for g, columns in enumerate(leaves):
+            leaf[g, : len(columns)] = columns
+            group[columns] = g
+            touched_by.append(np.flatnonzero(met[only[columns[0]], core]))
+
+        n_core = len(core)
+        touched = np.full((len(leaves), max(map(len, touched_by), default=0)), n_core)
+        number = np.full((len(leaves), n_columns), -1)
+        for g, places in enumerate(touched_by):
             touched[g, : len(places)] = places
-            number[g, groups[0][places]] = np.arange(len(places))
-        q, flat = len(groups[0]), touched.ravel()
-        spread = _summing(flat, np.flatnonzero(flat < q), q)
+            number[g, core[places]] = np.arange(len(places))
+
+        flat = touched.ravel()
+        spread = _summing(flat, np.flatnonzero(flat < n_core), n_core)
+
+        # Only the upper triangle of C is stored, and only the pairs that some mission touches.
         a, b = np.broadcast_arrays(touched[:, :, None], touched[:, None])
-        at, kept = (a * q + b).ravel(), np.flatnonzero((a <= b) & (b < q))
+        at = (a * n_core + b).ravel()
+        kept = np.flatnonzero((a <= b) & (b < n_core))
         pair, row = np.unique(at[kept], return_inverse=True)
         at[kept] = row
         pairs = _summing(at, kept, len(pair))
-        return cls(leaf, groups[0], group, place, touched, number, spread, pairs, pair, hidden)
+        return cls(leaf, core, group, place, touched, number, spread, pairs, pair, hidden)
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
         """Shapes of the blocks D, B and C at one point."""
-        (g, k), q = self.leaf.shape, len(self.core)
-        return (g, k, k), (g, k, self.touched.shape[1]), (q, q)
+        g, k = self.leaf.shape
+        t = self.touched.shape[1]
+        q = len(self.core)
+        return (g, k, k), (g, k, t), (q, q)
 
     @property
     def size(self) -> int:
@@ -98,15 +117,25 @@ class Order(NamedTuple):
 
     def entry(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return the index of precision entries (a, b), or -1 where (b, a) is stored instead."""
-        (g, k, t), q = self.shapes[1], len(self.core)
-        of_leaf, of_both = self.group[a] >= 0, (self.group[a] >= 0) & (self.group[b] >= 0)
+        _, (g, k, t), (q, _) = self.shapes
+        a_is_leaf = self.group[a] >= 0
+        b_is_leaf = self.group[b] >= 0
+        both_leaves = a_is_leaf & b_is_leaf
+
+        # The vector is D, B and C, each in the order of its rows.
         row = self.group[a] * k + self.place[a]
         number = self.number[self.group[a], b] if g else 0
-        index = np.where(of_both, row * k + self.place[b], g * k * k + row * t + number)
-        index = np.where(of_leaf, index, g * k * (k + t) + self.place[a] * q + self.place[b])
-        above = np.where(of_both, self.place[a] < self.place[b], self.place[a] > self.place[b])
-        other = (of_leaf == (self.group[b] >= 0)) & above
-        return np.where(other | (~of_leaf & (self.group[b] >= 0)), -1, index)
+        in_D = row * k + self.place[b]
+        in_B = g * k * k + row * t + number
+        in_C = g * k * (k + t) + self.place[a] * q + self.place[b]
+        index = np.where(a_is_leaf, np.where(both_leaves, in_D, in_B), in_C)
+
+        # Of D, the lower triangle is stored; of C, the upper one; B has no rows of the core.
+        is_other = np.where(
+            both_leaves, self.place[a] < self.place[b], self.place[a] > self.place[b]
+        )
+        is_other = (a_is_leaf == b_is_leaf) & is_other
+        return np.where(is_other | (~a_is_leaf & b_is_leaf), -1, index)
 
     def views(self, A: Any) -> Any:
         """Return views (point, ...) of the blocks D, B and C in vectors (point, entry)."""
@@ -128,10 +157,15 @@ class Factor(NamedTuple):
     @classmethod
     def of(cls, order: Order, A: Any) -> Self:
         """Factor precisions stored in vectors A (point, entry); in NumPy, A is overwritten."""
-        D, B, C = order.views(A)
         xp = namespace(A)
-        padding = (order.leaf == len(order.place))[..., None] * np.eye(order.leaf.shape[1])
+        D, B, C = order.views(A)
+
+        # G G' = D; padded leaves get a unit diagonal, so that D stays positive definite.
+        is_padding = order.leaf == len(order.place)
+        padding = np.where(is_padding[..., None], np.eye(order.leaf.shape[1]), 0.0)
         inverse = inverse_of_lower(cholesky(D + padding))
+
+        # H' H = C - X' X
         X = inverse @ B
         squares = (xp.swapaxes(X, 2, 3) @ X).reshape(len(A), -1)
         C = add_products(C.reshape(len(A), -1), order.pair, order.pairs, -squares).reshape(C.shape)
@@ -150,24 +184,32 @@ class Factor(NamedTuple):
 
     def forward(self, h: Any) -> Any:
         """Compute whitened vectors F^-1 h from vectors h (point, column)."""
-        xp, order = namespace(h), self.order
-        h = xp.concatenate([h, xp.zeros((len(h), 1))], axis=1)
+        xp = namespace(h)
+        order = self.order
+        h = xp.concatenate([h, xp.zeros((len(h), 1))], axis=1)  # 0 for padded leaves
+
         leaf = (self.inverse @ h[:, order.leaf][..., None])[..., 0]
         back = xp.einsum("ngkt,ngk->ngt", self.X, leaf).reshape(len(h), -1)
+
         rest = h[:, order.core] - times(order.spread, back)
         core = solve_upper(self.H, rest[:, None], transposed=True)[:, 0]
         return xp.concatenate([leaf.reshape(len(h), -1), core], axis=1)
 
     def back(self, white: Any) -> Any:
         """Compute vectors F'^-1 w (point, draw, column) from whitened w (point, draw, ...)."""
-        xp, order, split = namespace(white), self.order, self.order.leaf.size
-        core = solve_upper(self.H, white[..., split:], transposed=False)
-        leaf = white[..., :split].reshape(*white.shape[:2], *order.leaf.shape)
+        xp = namespace(white)
+        order = self.order
+        n_leaves = order.leaf.size
+        core = solve_upper(self.H, white[..., n_leaves:], transposed=False)
+
+        leaf = white[..., :n_leaves].reshape(*white.shape[:2], *order.leaf.shape)
         padded = xp.concatenate([core, xp.zeros((*core.shape[:2], 1))], axis=2)
         touched = xp.moveaxis(padded[..., order.touched], 1, 3)  # (point, mission, touched, draw)
         leaf = xp.moveaxis(leaf, 1, 3) - self.X @ touched
         leaf = xp.moveaxis(xp.swapaxes(self.inverse, 2, 3) @ leaf, 3, 1)
-        found = xp.concatenate([leaf.reshape(*leaf.shape[:2], split), core], axis=2)
+
+        # Sort from leaves and core into the order of the columns; -1 marks the core in `group`.
+        found = xp.concatenate([leaf.reshape(*leaf.shape[:2], n_leaves), core], axis=2)
         group = np.where(order.group < 0, len(order.leaf), order.group)
         return found[..., group * order.leaf.shape[1] + order.place]
 
@@ -175,36 +217,45 @@ class Factor(NamedTuple):
         """Compute whitened vectors F' c from vectors c (point, column)."""
         order = self.order
         c = np.column_stack([c, np.zeros(len(c))])
-        leaf, core = c[:, order.leaf], c[:, order.core]
+        leaf = c[:, order.leaf]
+        core = c[:, order.core]
+
         leaf = np.linalg.solve(np.swapaxes(self.inverse, 2, 3), leaf[..., None])[..., 0]
         padded = np.column_stack([core, np.zeros(len(core))])
         leaf = leaf + np.einsum("ngkt,ngt->ngk", self.X, padded[:, order.touched])
+
         core = np.einsum("nij,nj->ni", np.triu(self.H), core)
         return np.concatenate([leaf.reshape(len(c), -1), core], axis=1)
 
     def covariance(self) -> Any:
         """Compute A^-1 at the stored entries of A, with halved diagonals for sums over pairs."""
         C = inverse_of_upper(self.H)
-        transposed, q = self.inverse.swapaxes(2, 3), C.shape[1]
-        i = np.minimum(self.order.touched, q - 1)
-        B = -transposed @ self.X @ C[:, i[..., None], i[:, None]]  # X is 0 in the padding
+        transposed = self.inverse.swapaxes(2, 3)
+
+        i = np.minimum(self.order.touched, C.shape[1] - 1)  # any column; X is 0 in the padding
+        B = -transposed @ self.X @ C[:, i[..., None], i[:, None]]
         D = transposed @ self.inverse - B @ (transposed @ self.X).swapaxes(2, 3)
         return self._entries(D, B, C)
 
     def _entries(self, D: Any, B: Any, C: Any) -> Any:
         """Join D, B and C in vectors like those of A, with halved diagonals of D and C."""
-        xp, n = namespace(C), len(C)
         D, C = (M * (1.0 - 0.5 * np.eye(M.shape[-1])) for M in (D, C))
-        return xp.concatenate([M.reshape(n, -1) for M in (D, B, C)], axis=1)
+        return namespace(C).concatenate([M.reshape(len(C), -1) for M in (D, B, C)], axis=1)
 
     def outer(self, c: Any) -> Any:
         """Compute the same entries as `covariance`, for the matrices cc' of c (point, column)."""
-        xp, order = namespace(c), self.order
-        c = xp.concatenate([c, xp.zeros((len(c), 1))], axis=1)
-        leaf, core = c[:, order.leaf], c[:, order.core]
-        touched = xp.concatenate([core, xp.zeros((len(c), 1))], axis=1)[:, order.touched]
-        D, B = leaf[..., None] * leaf[:, :, None], leaf[..., None] * touched[:, :, None]
-        return self._entries(D, B, core[..., None] * core[:, None])
+        xp = namespace(c)
+        order = self.order
+        zero = xp.zeros((len(c), 1))  # for the padding
+        c = xp.concatenate([c, zero], axis=1)
+        leaf = c[:, order.leaf]
+        core = c[:, order.core]
+        touched = xp.concatenate([core, zero], axis=1)[:, order.touched]
+
+        D = leaf[..., None] * leaf[:, :, None]
+        B = leaf[..., None] * touched[:, :, None]
+        C = core[..., None] * core[:, None]
+        return self._entries(D, B, C)
 
 
 def _summing(row: np.ndarray, kept: np.ndarray, n: int) -> Any:
@@ -217,8 +268,9 @@ def times(M: Any, x: Any) -> Any:
     """Multiply a sparse matrix by vectors x (point, column); returns vectors (point, row)."""
     if isinstance(x, np.ndarray):
         return np.ascontiguousarray((M @ x.T).T)
-    if 20 * M.nnz > M.shape[0] * M.shape[1]:
+    if _DENSE * M.nnz > M.shape[0] * M.shape[1]:
         return x @ M.T.toarray()
+
     M = M.tocoo()
     order = np.argsort(M.row, kind="stable")
     terms = M.data[order, None] * x.T[M.col[order]]
@@ -236,6 +288,7 @@ def add_products(A: Any, at: np.ndarray, M: Any, x: Any) -> Any:
     """
     if not isinstance(A, np.ndarray):
         return A.at[:, at].add(times(M, x))
+
     _add_products(A, at, M.indptr, M.indices, M.data, np.ascontiguousarray(x))
     return A
 
@@ -262,6 +315,7 @@ def add(A: Any, at: Any, values: Any) -> Any:
     """Add values to an array at an index, in place in NumPy and to a copy in JAX."""
     if not isinstance(A, np.ndarray):
         return A.at[at].add(values)
+
     A[at] += values
     return A
 
@@ -277,8 +331,10 @@ def upper_factor(A: Any) -> Any:
     if not isinstance(A, np.ndarray):
         lower = jax.lax.linalg.cholesky(A.mT, symmetrize_input=False)
         return lower.mT
+
     for one in A:
-        if lapack.dpotrf(one.T, lower=1, clean=0, overwrite_a=1)[1]:  # pyright: ignore[reportAttributeAccessIssue]
+        _, failed = lapack.dpotrf(one.T, lower=1, clean=0, overwrite_a=1)  # pyright: ignore[reportAttributeAccessIssue]
+        if failed:
             one[:] = np.nan
     return A
 
@@ -291,11 +347,15 @@ def chain_factor(A: Any, n_missions: int, n_chains: int) -> Any:
     """
     if not isinstance(A, np.ndarray):
         return upper_factor(A)
-    n, step = n_missions * n_chains, n_chains * -(-_CHAIN_BLOCK // n_chains)
+
+    n = n_missions * n_chains
+    step = n_chains * -(-_CHAIN_BLOCK // n_chains)  # whole missions
     for one in A:
+        # Block Cholesky: columns i:j of the chain are coupled to j:k and, outside of it, to n:.
         for i in range(0, n, step):
             j = min(i + step, n)
             k = min(j + step, n)
+
             L, failed = lapack.dpotrf(one[i:j, i:j].T, lower=1, clean=1)  # pyright: ignore[reportAttributeAccessIssue]
             inverse = lapack.dtrtri(L, lower=1)[0]  # pyright: ignore[reportAttributeAccessIssue]
             one[i:j, i:j] = L.T
@@ -307,6 +367,7 @@ def chain_factor(A: Any, n_missions: int, n_chains: int) -> Any:
             if failed:
                 one[:] = np.nan
                 break
+
         rest = one[n:, n:] - one[:n, n:].T @ one[:n, n:]
         L, failed = lapack.dpotrf(rest.T, lower=1, clean=0, overwrite_a=1)  # pyright: ignore[reportAttributeAccessIssue]
         one[n:, n:] = np.nan if failed else L.T
@@ -319,7 +380,8 @@ def solve_upper(H: Any, x: Any, *, transposed: bool) -> Any:
         return jax.lax.linalg.triangular_solve(
             H, x.mT, left_side=True, lower=False, transpose_a=transposed
         ).mT
-    trans = 0 if transposed else 1
+
+    trans = 0 if transposed else 1  # LAPACK sees the transposed matrices, as it stores columns
     pairs = zip(H, x, strict=True)
     return np.stack([lapack.dtrtrs(h.T, y.T, lower=1, trans=trans)[0].T for h, y in pairs])  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -328,6 +390,7 @@ def inverse_of_lower(L: Any) -> Any:
     """Compute the inverses of lower triangular matrices (..., n, n)."""
     if isinstance(L, np.ndarray):
         return np.linalg.inv(L)
+
     one = jnp.broadcast_to(jnp.eye(L.shape[-1]), L.shape)
     return jax.lax.linalg.triangular_solve(L, one, left_side=True, lower=True)
 
@@ -352,6 +415,7 @@ def cholesky(A: Any) -> Any:
     """Compute lower Cholesky factors, with NaN where a matrix is not positive definite."""
     if not isinstance(A, np.ndarray):
         return jax.lax.linalg.cholesky(A, symmetrize_input=False)
+
     try:
         return np.linalg.cholesky(A)
     except np.linalg.LinAlgError:  # one bad point must not invalidate the others

@@ -27,24 +27,68 @@ from arviz_stats.base.array import array_stats
 from scipy import optimize, special, stats
 from scipy.linalg import solve_triangular
 
-GOOD_KHAT, MAX_KHAT = 0.5, 0.7
-"""Limits on the Pareto shape k-hat of the weights, for stopping and for acceptable results."""
+GOOD_KHAT = 0.5
+"""Pareto shape k-hat of the weights below which sampling may stop."""
+MAX_KHAT = 0.7
+"""Largest k-hat of acceptable results."""
 ENOUGH = 400.0
 """Effective number of points at which sampling stops."""
-_DEGREES = 8.0  # degrees of freedom of the proposals
-_WIDER = 1.1  # scale of a proposal relative to the points that it is fitted to
-_KERNELS, _KERNEL_SCALE = 16, 0.7  # number of kernels, and their scale relative to the points
-_DEFENSIVE = 8  # points of other proposals per defensive point after the first round
-_EFFICIENCY = 0.6  # effective points expected per point, to choose the size of the last rounds
-_LEAST_ROUND = 4  # smallest round, as a divisor of the usual number of points
-_PER_AXIS = 4.0  # effective points per dimension needed to estimate moments
-_SLOPE_STEP, _CURVATURE_STEP = 1e-3, 3e-2  # steps of finite differences
-_WIDTH_STEP, _CURVATURES = 0.1, (0.5, 1e4)  # step and limits of curvatures at the start of a search
-_CLOSE = 0.1  # a search for a mode ends when a step gains less than this log density
-_LEAST_CURVATURE = 0.3  # least curvature of -log density at a mode; the prior has curvature 1
-_SKEW_STEP, _SKEWS = 2.0, (0.3, 3.0)  # where skewness is measured, in sds, and its limits
-_SHIFTS = np.linspace(-1.5, 1.5, 31)  # differences that are tried of a center and the mean, in sds
-_FARTHEST = 7.0  # largest absolute score of a mode
+_DEGREES = 8.0
+"""Degrees of freedom of the proposals."""
+_PRIOR_SCALE = 1.2
+"""Scale of the usual defensive proposal; the prior has scale 1."""
+_WIDER = 1.1
+"""Scale of a proposal relative to the points that it is fitted to."""
+_KERNELS = 16
+"""Number of kernels."""
+_KERNEL_SCALE = 0.7
+"""Scale of a kernel relative to that of all points."""
+_DEFENSIVE = 8
+"""Points of other proposals per defensive point after the first round."""
+_EFFICIENCY = 0.6
+"""Effective points expected per point, to choose the size of the last rounds."""
+_LEAST_ROUND = 4
+"""Smallest round, as a divisor of the usual number of points."""
+_PER_AXIS = 4.0
+"""Effective points per dimension needed to estimate moments."""
+_FLATTENED = 6
+"""Most times that uneven weights are replaced by their square roots."""
+_SLOPE_STEP = 1e-3
+"""Step of the finite differences of slopes."""
+_CURVATURE_STEP = 3e-2
+"""Step of the finite differences of the curvature at a mode."""
+_WIDTH_STEP = 0.1
+"""Step of the finite differences of curvatures at the start of a search."""
+_CURVATURES = (0.5, 1e4)
+"""Limits of the curvatures at the start of a search."""
+_N_STEPS = 40
+"""Most steps of a search for a mode."""
+_CLOSE = 0.1
+"""A search for a mode ends when a step gains less than this log density."""
+_LARGEST_COST = 1e10
+"""Replaces an infinite -log density, which a search or a finite difference cannot use."""
+_LEAST_CURVATURE = 0.3
+"""Least curvature of -log density at a mode; the prior has curvature 1."""
+_LEAST_DROP = 1e-3
+"""Least drop of the log density that gives the width of a side."""
+_APART = 1.0
+"""Distance in sds at which two modes are distinct."""
+_NEGLIGIBLE = 8.0
+"""Log density below the highest mode at which a mode is left out."""
+_SKEW_STEP = 2.0
+"""Where skewness is measured, in sds."""
+_SKEWS = (0.3, 3.0)
+"""Limits of the width of a side relative to that of both."""
+_SHIFTS = np.linspace(-1.5, 1.5, 31)
+"""Differences that are tried of a center and the mean, in sds."""
+_FARTHEST = 7.0
+"""Largest absolute score of a mode."""
+_EDGE = 1e-12
+"""Least distance of uniform numbers from 0 and 1, at which quantiles are infinite."""
+_EVEN = 1e-6
+"""Range of log ratios within which weights count as equal."""
+_BELOW_ALL = 100.0
+"""Log ratio of points without density, relative to the smallest that is finite."""
 
 LogDensity = Callable[[np.ndarray], np.ndarray]
 """Log density (point,) of scores (point, score) up to a constant; -inf for zero density."""
@@ -99,10 +143,11 @@ class Student(NamedTuple):
     def draw(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw points (n, score) with a scrambled Sobol sequence; n must be a power of 2."""
         d = len(self.center)
-        uniform = np.clip(stats.qmc.Sobol(d + 1, rng=rng).random(n), 1e-12, 1.0 - 1e-12)
+        uniform = np.clip(stats.qmc.Sobol(d + 1, rng=rng).random(n), _EDGE, 1.0 - _EDGE)
         chi2 = 2.0 * special.gammaincinv(0.5 * _DEGREES, uniform[:, d:]) / _DEGREES
 
-        u, negative = uniform[:, :d], self.sides[0] / self.sides.sum(0)
+        u = uniform[:, :d]
+        negative = self.sides[0] / self.sides.sum(0)  # probability of a negative element
         below = 0.5 * u / negative
         above = 0.5 + 0.5 * (u - negative) / (1.0 - negative)
         x = special.ndtri(np.where(u < negative, below, above)) / np.sqrt(chi2)
@@ -110,7 +155,8 @@ class Student(NamedTuple):
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, score)."""
-        nu, d = _DEGREES, len(self.center)
+        nu = _DEGREES
+        d = len(self.center)
         x = solve_triangular(self.scale, (z - self.center).T, lower=True).T
         square = ((x / np.where(x < 0.0, *self.sides)) ** 2).sum(1)
 
@@ -137,6 +183,8 @@ def two_piece(
     for k, shift in enumerate(_SHIFTS):
         for side, sign in enumerate((-1.0, 1.0)):
             own = weight @ np.maximum(sign * (x - shift), 0.0) ** 2
+
+            # E[max(e - a, 0)^2] of a standard normal e
             a = sign * shift
             density = np.exp(-0.5 * a**2) / np.sqrt(2.0 * np.pi)
             standard = (1.0 + a**2) * special.ndtr(-a) - a * density
@@ -181,11 +229,13 @@ class Points(NamedTuple):
     @property
     def proposal(self) -> Student:
         """Fit a Student-t to the points; if few points dominate, flatten their weights."""
-        weight, least = self.weight, _PER_AXIS * self.z.shape[1]
-        for _ in range(6):
+        weight = self.weight
+        least = _PER_AXIS * self.z.shape[1]
+        for _ in range(_FLATTENED):
             if (weight**2).sum() * least <= 1.0:
                 break
             weight = np.sqrt(weight) / np.sqrt(weight).sum()
+
         return Student.of(self.z, weight, self.near)
 
     def resample(self, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -228,44 +278,58 @@ def sample(
             recorded with each point; by default `log_density`.
     """
     d = starts.shape[1]
-    prior = Student(np.zeros(d), 1.2 * np.eye(d))
+    prior = Student(np.zeros(d), _PRIOR_SCALE * np.eye(d))
     visit = visit or log_density
-    z, log_p, mixture = np.empty((0, d)), np.empty(0), []
 
+    # Step 1: the proposals of the first round.
     modes = [first] if first else find_modes(log_density, starts)
     several = modes if len(modes) > 1 else []
-    current, uneven = modes[0], False
-    n_own, n_others = size // 2, size // 2
+    current = modes[0]
     if first:  # the region of the posterior is known
-        n_own, n_others = size, size // _DEFENSIVE
+        n_own = size
+        n_others = size // _DEFENSIVE
+    else:
+        n_own = size // 2
+        n_others = size // 2
     own = _shares([current.scaled(_WIDER), *several], n_own)
+
+    z = np.empty((0, d))
+    log_p = np.empty(0)
+    mixture = []
+    uneven = False
     n_rounds = 0
     while True:
+        # Step 2: draw points, and weigh all points so far by the mixture of all proposals so far.
         n_rounds += 1
         others = defensive(current) if defensive else prior
         for density, n in [*own, (others, n_others)]:
             new = density.draw(n, rng)
-            z, log_p = np.vstack([z, new]), np.append(log_p, visit(new))
+            z = np.vstack([z, new])
+            log_p = np.append(log_p, visit(new))
             mixture.append((density, n))
 
         log_q = [density.log_density(z) + np.log(n) for density, n in mixture]
         log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
         log_ratio = np.where(np.isfinite(log_p), log_p, -np.inf) - log_q
         points = Points.of(z, log_p, log_ratio, modes[0])
+
         good = points.k_hat < GOOD_KHAT
         if (good and points.kish > enough and n_rounds > 1) or n_rounds == most:
             return points
 
+        # Step 3: fit the proposal of the next round, which is as large as the missing points need.
         current = points.proposal
         uneven = uneven or (not good and n_rounds > 1)
-        missing = max(enough - points.kish, 1.0) / _EFFICIENCY
-        n_own = int(np.clip(2 ** np.ceil(np.log2(missing)), size // _LEAST_ROUND, size))
-        own = _shares([current.scaled(_WIDER), *several], n_own)
         if uneven:
             n_own = size
-            kernel, chosen = current.scaled(_KERNEL_SCALE), points.resample(_KERNELS, rng)
+            kernel = current.scaled(_KERNEL_SCALE)
+            chosen = points.resample(_KERNELS, rng)
             kernels = [kernel._replace(center=center) for center in points.z[chosen]]
             own = [(current.scaled(_WIDER), size // 2), *_shares(kernels, size // 2)]
+        else:
+            missing = max(enough - points.kish, 1.0) / _EFFICIENCY
+            n_own = int(np.clip(2 ** np.ceil(np.log2(missing)), size // _LEAST_ROUND, size))
+            own = _shares([current.scaled(_WIDER), *several], n_own)
         n_others = n_own // _DEFENSIVE
 
 
@@ -282,10 +346,12 @@ def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
         found.append((float(log_density(mode.center[None])[0]), mode))
     found.sort(key=lambda pair: -pair[0])
 
-    modes = [found[0][1]]
+    highest, first = found[0]
+    modes = [first]
     for value, mode in found[1:]:
         gaps = [np.linalg.solve(m.scale, mode.center - m.center) for m in modes]
-        if min(np.linalg.norm(gap) for gap in gaps) > 1.0 and value > found[0][0] - 8.0:
+        is_new = min(np.linalg.norm(gap) for gap in gaps) > _APART
+        if is_new and value > highest - _NEGLIGIBLE:
             modes.append(mode)
     return modes
 
@@ -305,10 +371,10 @@ def climb(log_density: LogDensity, start: np.ndarray) -> np.ndarray:
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
         steps = np.vstack([np.zeros((1, d)), _SLOPE_STEP * axes])
         value = -log_density(start + width * (x + steps))
-        value = np.minimum(np.nan_to_num(value, nan=np.inf), 1e10)
+        value = np.minimum(np.nan_to_num(value, nan=np.inf), _LARGEST_COST)
         return value[0], (value[1:] - value[0]) / _SLOPE_STEP
 
-    options = {"maxiter": 40, "ftol": _CLOSE / max(1.0, abs(value[0]))}
+    options = {"maxiter": _N_STEPS, "ftol": _CLOSE / max(1.0, abs(value[0]))}
     farthest = np.stack([-_FARTHEST - start, _FARTHEST - start], axis=1) / width[:, None]
     found = optimize.minimize(
         cost, np.zeros(d), jac=True, method="L-BFGS-B", bounds=farthest, options=options
@@ -325,17 +391,25 @@ def fit_mode(log_density: LogDensity, mode: np.ndarray) -> Student:
     axes = np.eye(d)
     i, j = np.tril_indices(d, -1)
     steps = np.vstack([np.zeros((1, d)), axes, -axes, axes[i] + axes[j]])
-    f = np.nan_to_num(log_density(mode + _CURVATURE_STEP * steps), nan=-1e10, neginf=-1e10)
+    f = _finite(log_density(mode + _CURVATURE_STEP * steps))
     up, down, both = f[1 : d + 1], f[d + 1 : 2 * d + 1], f[2 * d + 1 :]
+
+    # Second differences; flat or rising directions get the least curvature.
     hessian = np.diag(up - 2.0 * f[0] + down)
     hessian[i, j] = hessian[j, i] = both - up[i] - up[j] + f[0]
     curvature, vectors = np.linalg.eigh(-hessian / _CURVATURE_STEP**2)
     scale = np.linalg.cholesky(vectors / np.maximum(curvature, _LEAST_CURVATURE) @ vectors.T)
 
+    # A normal distribution with width s drops by (step / s)^2 / 2.
     steps = _SKEW_STEP * np.stack([-scale.T, scale.T])
     there = log_density((mode + steps).reshape(-1, d)).reshape(2, d)
-    drop = np.maximum(f[0] - np.nan_to_num(there, nan=-1e10, neginf=-1e10), 1e-3)
+    drop = np.maximum(f[0] - _finite(there), _LEAST_DROP)
     return Student(mode, scale, np.clip(_SKEW_STEP / np.sqrt(2.0 * drop), *_SKEWS))
+
+
+def _finite(log_p: np.ndarray) -> np.ndarray:
+    """Replace NaN and -inf by a log density that is very low but finite."""
+    return np.nan_to_num(log_p, nan=-_LARGEST_COST, neginf=-_LARGEST_COST)
 
 
 def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:
@@ -346,11 +420,14 @@ def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:
     """
     finite = np.isfinite(log_ratio)
     log_mean = float(special.logsumexp(log_ratio) - np.log(len(log_ratio)))
-    if finite.all() and np.ptp(log_ratio) < 1e-6:  # equal weights have no tail
+    if finite.all() and np.ptp(log_ratio) < _EVEN:  # equal weights have no tail
         return np.full(len(log_ratio), 1.0 / len(log_ratio)), -np.inf, log_mean
-    kept = np.where(finite, log_ratio, log_ratio[finite].min() - 100.0)
+
+    # Vehtari et al. (2024) in ArviZ, which takes log likelihoods, with the opposite sign.
+    kept = np.where(finite, log_ratio, log_ratio[finite].min() - _BELOW_ALL)
     log_weight, k_hat = array_stats.psislw(-kept)
-    return special.softmax(log_weight), float(np.nan_to_num(k_hat, nan=np.inf)), log_mean
+    k_hat = float(np.nan_to_num(k_hat, nan=np.inf))
+    return special.softmax(log_weight), k_hat, log_mean
 
 
 def systematic(weight: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
