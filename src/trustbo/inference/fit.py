@@ -18,7 +18,7 @@ from trustbo.errors import (
     require_kind,
     require_whole,
 )
-from trustbo.inference.density import Columns, Density, Draws
+from trustbo.inference.density import SWEEPS, Columns, Density, Draws
 from trustbo.inference.importance import (
     MAX_KHAT,
     LogDensity,
@@ -42,7 +42,17 @@ from trustbo.stacking import known_awareness, require_same_team
 from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
-_CORRECTED = 2  # draws whose density by EP is corrected, per point of a round
+"""Names of the samplers of `fit`."""
+_CORRECTED = 2
+"""Number of draws whose density by EP is corrected, per point of a round."""
+_SIZE = 256
+"""Points per round of the importance sampler."""
+_LAST_SIZE = 1024
+"""Points per round of the last attempt."""
+_LAST_SWEEPS = 4
+"""EP sweeps at each point in the last attempt; usually `SWEEPS`."""
+_MANY_SCORES = 12
+"""Number of scores from which a round has four times as many points."""
 
 
 @computing()
@@ -117,6 +127,7 @@ def fit(
         missions = [workspace.fill(mission) for mission in missions]
         missions = [missions[j] for j in known_awareness(missions)]
         require_same_team(missions)  # also that one is left
+
     if model is None:
         scale = missions[0].scale  # empty unless the missions are people's reports
         model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))
@@ -127,17 +138,21 @@ def fit(
     if warmup is not None:
         warmup = require_count("warmup", warmup)
     seed = require_whole("seed", seed, 0)
+
     model = model.for_features(missions[0].features)
     observations = model.observations(missions, workspace)
     if np.isnan(observations.contact_rate).all():
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
+
     density = Density(model, observations)
     if sampler == "importance":
-        chains, draws = 1, chains * draws  # independent draws belong to one chain
+        draws = chains * draws
+        chains = 1  # independent draws belong to one chain
         first = _first_proposal(start, model)
         with slow_bar("fit", " points", progress) as bar:
             density.evaluated = bar.update
             drawn, stats, summary = by_importance(density, draws, seed, first)
+
         complaints = []
         if not summary["k_hat"] <= MAX_KHAT:
             reason = f"k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT}"
@@ -154,6 +169,7 @@ def fit(
     if "proposal" in summary:
         tree["sample_stats"].attrs["proposal"] = summary.pop("proposal")
     tree.attrs |= _record(model, density) | summary | {"sampler": sampler, "seed": seed}
+
     if check and complaints:
         raise PosteriorError(
             f"the sampler's diagnostics are bad: {'; '.join(complaints)}.",
@@ -161,6 +177,7 @@ def fit(
             "Give more missions, use narrower priors or, for NUTS, increase draws and warmup. To "
             "get the posterior anyway, pass check=False.",
         )
+
     if whole:
         as_read = draws_of(density, variables)  # equal to those that `complete` reads from a file
         tree = with_latent(tree, missions, density, as_read, progress=progress)
@@ -178,11 +195,15 @@ def by_importance(
     """
     rng = np.random.default_rng(seed)
     draw = _exact_draws if density.exact else _ep_draws
-    attempts = [(256, 1, first), (256, 1, None), (1024, 4, None)]
-    attempts = attempts if first else attempts[1:]
+
+    attempts = [(_SIZE, SWEEPS, None), (_LAST_SIZE, _LAST_SWEEPS, None)]
+    if first:
+        attempts = [(_SIZE, SWEEPS, first), *attempts]
     while True:
         size, n_sweeps, proposal = attempts.pop(0)
-        size = size if density.n_scores < 12 else 4 * size
+        if density.n_scores >= _MANY_SCORES:
+            size = 4 * size
+
         drawn, log_p, summary = draw(density, n, size, n_sweeps, rng, proposal)
         if summary["k_hat"] <= MAX_KHAT or not attempts:
             return drawn, {"lp": log_p}, summary
@@ -206,8 +227,10 @@ def _exact_draws(
 
     points = _points(density, size, rng, first, visit)
     chosen = points.resample(n, rng)
+
     c = Columns.joined(visited).draw(chosen, rng)
     drawn = Draws(density.theta(points.z[chosen]), c)
+
     summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
     return drawn, points.log_p[chosen], summary | {"proposal": points.proposal.text}
 
@@ -222,11 +245,13 @@ def _ep_draws(
 ) -> tuple[Draws, np.ndarray, dict[str, Any]]:
     """Draw n times given other rates, and correct the density of scores by EP with weights."""
     points = _points(density, size, rng, first)
+
     # Correcting EP at these points takes most time, but more points make k-hat more reliable.
     some = points.resample(_CORRECTED * size, rng)
     drawn, log_ratio = density.draw_by_ep(points.z[some], points.log_p[some], rng, n_sweeps)
     weight, k_hat, log_mean = smoothed(log_ratio)
     chosen = systematic(weight, n, rng)
+
     summary = {
         "k_hat": max(points.k_hat, k_hat),
         "kish": 1.0 / float((np.bincount(some, weight) ** 2).sum()),
@@ -249,6 +274,7 @@ def _points(
     else:
         start = first.center
         density.run_ep(density.theta(start[None]))
+
     return sample(
         density.log_density, start[None], rng,
         size=size, defensive=density.defensive, first=first, visit=visit,
@@ -259,6 +285,7 @@ def _first_proposal(start: xr.DataTree | None, model: TrustModel) -> Student | N
     """Return the proposal of a posterior of the same model, or None if there is none."""
     if start is None or start.attrs["model_record"] != json.dumps(model_to_record(model)):
         return None
+
     text = start["sample_stats"].attrs.get("proposal")
     return None if text is None else Student.from_text(text)
 
@@ -278,10 +305,12 @@ def _laid_out(
         group: {name: v.reshape(*shape, *v.shape[1:]) for name, v in values.items()}
         for group, values in groups.items()
     }
-    places, model = groups.pop("places", None), density.model
+    places = groups.pop("places", None)  # has axes of its own
+
     prior_draws = prior_parameters(density, N_PRIOR, rng)
     groups["prior"] = {name: values[None] for name, values in prior_draws.items()}
-    tree = to_datatree(groups, missions, model.dims, model.effects)
+
+    tree = to_datatree(groups, missions, density.model.dims, density.model.effects)
     if places is not None:
         tree["places"] = xr.DataTree(place_group(places, density.observations.visited, seed))  # pyright: ignore[reportArgumentType]
     return tree

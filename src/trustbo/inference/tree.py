@@ -27,9 +27,12 @@ from trustbo.streams import stream
 
 _OF_RATES = ("mission", "bound", "robot")
 _DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_RATES)
-_N_TRAJECTORIES = 200  # kept draws of latent trust and predicted rates, evenly spaced in the chains
-N_PRIOR = 500  # draws in the groups `prior` and `prior_predictive`
-_KEPT = ("posterior", "sample_stats", "prior", "hazard")  # groups kept by `parameters_alone`
+_N_TRAJECTORIES = 200
+"""Kept draws of latent trust and predicted rates, evenly spaced in the chains."""
+N_PRIOR = 500
+"""Number of draws in the groups `prior` and `prior_predictive`."""
+_KEPT = ("posterior", "sample_stats", "prior", "hazard")
+"""Groups kept by `parameters_alone`, besides those of the effects."""
 
 
 def to_datatree(
@@ -50,6 +53,7 @@ def to_datatree(
     n_missions, n_bounds = observed.contact_rate.shape[:2]
     lengths = np.array([len(m.bounds) for m in missions])
     ended = (np.arange(1, n_bounds + 1) > lengths[:, None])[..., None]  # (mission, bound, robot)
+
     coords = {
         "mission": np.arange(n_missions),
         "bound": np.arange(1, n_bounds + 1),
@@ -61,25 +65,32 @@ def to_datatree(
     for effect in effects:
         dims_of |= effect.variables
         coords |= effect.coords
+
     tree = {}
     for group, arrays in groups.items():
         draw = arrays.pop("draw", None)
-        variables, used, shape = {}, set(), (0, 0)
+        variables = {}
+        used = set()
+        shape = (0, 0)  # of chains and draws
         for name, array in arrays.items():
             dims = ("mission",) if group.endswith("log_likelihood") else dims_of.get(name, ())
             kept = array[(..., *(slice(len(coords[d])) for d in dims))]
             if "bound" in dims:
                 kept = np.where(ended, np.nan, kept)
             if len(dims) < array.ndim:
-                dims, shape = ("chain", "draw", *dims), array.shape[:2]
+                dims = ("chain", "draw", *dims)
+                shape = array.shape[:2]
             variables[name] = (dims, kept)
             used |= set(dims)
+
         index = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
-        index = index if draw is None else index | {"draw": draw}
+        if draw is not None:
+            index["draw"] = draw
         labelled = {name: labels for name, labels in (coords | index).items() if name in used}
         # ArviZ takes the dims from the first variable, so variables with the most dims come first.
         ordered = dict(sorted(variables.items(), key=lambda item: -len(item[1][0])))
         tree[group] = xr.Dataset(ordered, labelled)
+
     tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
     return xr.DataTree.from_dict(tree)
 
@@ -89,15 +100,20 @@ def _data_groups(
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Build the groups `observed_data` and `constant_data`."""
     shape = observed.contact_rate.shape
-    duration, cell = np.full(shape, np.nan), np.full((*shape[:2], 2), -1)
+    duration = np.full(shape, np.nan)
+    cell = np.full((*shape[:2], 2), -1)
     for j, mission in enumerate(missions):
         duration[j, : len(mission.bounds)] = mission.duration
         cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
     starts = [mission.path[0] if mission.path else NOWHERE for mission in missions]
+
     # The number of bounds follows from the cells, except for missions without a map.
-    n_bounds = [len(mission.bounds) for mission in missions]
-    counted = {} if all(m.path for m in missions) else {"n_bounds": (("mission",), n_bounds)}
-    dims, labelled = _OF_RATES, {name: coords[name] for name in _OF_RATES}
+    counted = {}
+    if not all(mission.path for mission in missions):
+        counted["n_bounds"] = (("mission",), [len(mission.bounds) for mission in missions])
+
+    dims = _OF_RATES
+    labelled = {name: coords[name] for name in _OF_RATES}
     rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, labelled)
     constant = xr.Dataset(
         {
@@ -120,6 +136,7 @@ def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     """Drop the groups that grow with the number of missions; see `complete`."""
     kept = [*_KEPT, *(effect.group for effect in effects_of(posterior))]
     kept = [name for name in kept if name in posterior.children]
+
     alone = xr.DataTree.from_dict({name: posterior[name].to_dataset() for name in kept})
     alone.attrs = posterior.attrs
     return alone
@@ -153,6 +170,7 @@ def complete(
     """
     if "latent" in require_posterior("complete", posterior).children:
         return posterior
+
     missions = missions_of(posterior) if missions is None else missions
     fitted, draws = read_posterior(posterior, missions, model=model)
     return with_latent(posterior, missions, fitted, draws, progress=progress)
@@ -177,10 +195,13 @@ def with_latent(
     """
     fitted.reset_ep()
     fitted.run_ep(draws.theta)
-    seed, sizes = posterior.attrs["seed"], posterior["posterior"].sizes
-    n_chains, n_draws = sizes["chain"], sizes["draw"]
-    kept = np.linspace(0, n_draws - 1, min(n_draws, max(1, _N_TRAJECTORIES // n_chains)))
-    kept = kept.astype(int)
+    seed = posterior.attrs["seed"]
+
+    sizes = posterior["posterior"].sizes
+    n_chains = sizes["chain"]
+    n_draws = sizes["draw"]
+    n_kept = min(n_draws, max(1, _N_TRAJECTORIES // n_chains))
+    kept = np.linspace(0, n_draws - 1, n_kept).astype(int)
     some = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
     with slow_bar("latent trust", " draws", progress) as bar:
         fitted.evaluated = bar.update
@@ -188,11 +209,16 @@ def with_latent(
 
     rng = stream(seed, "prior predictive")
     replicated = replicate(fitted, draw_prior(fitted, N_PRIOR, rng), rng)
+
+    # Log likelihoods of tick counts are comparable between families; NaN where ticks are unknown.
+    likelihood = latent.log_likelihood
+    likelihood_of = "contact_rate"
     shift = fitted.model.family.log_resolution(
         fitted.observations.contact_rate, fitted.observations.n_ticks
     ).sum((1, 2))
-    counted = not np.isnan(shift).any()
-    likelihood = latent.log_likelihood + (shift if counted else 0.0)
+    if not np.isnan(shift).any():
+        likelihood = likelihood + shift
+        likelihood_of = "ticks"
 
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
@@ -212,10 +238,11 @@ def with_latent(
             for name, values in log_prior(fitted, sites_of(posterior)).items()
         },
     }
+
     added = to_datatree(groups, missions, {})
     parts = {**posterior.children, **added.children}
     whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
-    whole.attrs = posterior.attrs | {"log_likelihood_of": "ticks" if counted else "contact_rate"}
+    whole.attrs = posterior.attrs | {"log_likelihood_of": likelihood_of}
     return whole
 
 
@@ -234,6 +261,7 @@ def log_prior(fitted: Density, sites: Mapping[str, np.ndarray]) -> dict[str, np.
     model, priors = fitted.model, fitted.scores.priors
     resolution = fitted.observations.resolution
     inverse_gain = model.derived(sites)["inverse_gain"]
+
     parameters = dict(sites)
     if "delta_v" in sites:
         parameters["delta_v"] = model.noise_without(sites["delta_v"], resolution)
@@ -243,10 +271,12 @@ def log_prior(fitted: Density, sites: Mapping[str, np.ndarray]) -> dict[str, np.
             values = model.noise_without(values, resolution)
         given = inverse_gain.reshape(*inverse_gain.shape, *(1,) * (values.ndim - inverse_gain.ndim))
         densities[name] = model.priors.log_density(field, values, given)
+
     for noise in ("Delta_w", "Delta_v"):
         if noise in sites:
             sd = np.sqrt(np.einsum("...ii->...i", sites[noise]))
             correlation = sites[noise] / (sd[..., :, None] * sd[..., None, :])
             log_det = np.linalg.slogdet(correlation)[1]
             densities[f"correlation_{noise[-1]}"] = (model.priors.concentration - 1.0) * log_det
+
     return {name: values.reshape(len(values), -1).sum(1) for name, values in densities.items()}
