@@ -23,10 +23,14 @@ from trustbo.parallel import computing
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
-QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)  # of predictions
-_DAY_SEED = 20261123  # seed of the next mission's robot effects, so that bands are reproducible
-_N_MEAN = 4096  # draws averaged to compute a prior mean
-_ATTRIBUTES = "observation", "x0_mean", "x0_sd", "model_record"  # required in a posterior
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+"""Quantiles of predictions."""
+_DAY_SEED = 20261123
+"""Seed of the next mission's robot effects, so that bands are reproducible."""
+_N_MEAN = 4096
+"""Number of draws averaged to compute a prior mean."""
+_ATTRIBUTES = ("observation", "x0_mean", "x0_sd", "model_record")
+"""Attributes that a posterior must have."""
 
 
 def require_posterior(who: str, value: object) -> xr.DataTree:
@@ -34,15 +38,19 @@ def require_posterior(who: str, value: object) -> xr.DataTree:
     if not isinstance(value, xr.DataTree):
         remedy = " Give the attribute .posterior." if hasattr(value, "posterior") else ""
         raise TrustboError(f"{who} needs a posterior from fit; got {type(value).__name__}.{remedy}")
-    missing = [] if "posterior" in value.children else ["posterior"]
-    missing += [name for name in _ATTRIBUTES if name not in value.attrs]
+
+    missing = [name for name in _ATTRIBUTES if name not in value.attrs]
+    if "posterior" not in value.children:
+        missing.insert(0, "posterior")
     if missing:
         raise TrustboError(
             f"{who} needs a posterior from fit, but this DataTree has no {missing[0]!r}. Give the "
             "complete result of trustbo.fit."
         )
+
     sizes = value["posterior"].sizes
-    if lacks := [dim for dim in ("chain", "draw") if not sizes.get(dim)]:
+    lacks = [dim for dim in ("chain", "draw") if not sizes.get(dim)]
+    if lacks:
         raise TrustboError(
             f"{who} needs the draws of a posterior, with the dims chain and draw, but there is no "
             f"{lacks[0]}. Keep all draws, or select with a list, such as posterior.isel(chain=[0])."
@@ -61,11 +69,13 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     """
     model = with_default_priors(json.loads(posterior.attrs["model_record"]))
     axes = model.dims | model.effect_dims
-    sites = {}
     draws = posterior["posterior"].to_dataset()
+
+    sites = {}
     for name in map(str, draws):
         if name not in axes:
             continue
+
         array = draws[name]
         dims = ("chain", "draw", *axes[name])
         if set(array.dims) != set(dims):
@@ -74,6 +84,7 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
                 "posterior from trustbo.fit with all its dims."
             )
         sites[name] = joined_draws(array, axes[name])
+
     for name, values in sites.items():
         bad = np.isnan(values.reshape(len(values), -1)).any(1).sum()
         if bad:
@@ -139,14 +150,18 @@ def _read_params(
     if workspace is not None:
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         posterior = in_order_of(posterior, workspace.team.names, workspace.features)
-    sites, attrs = sites_of(posterior), posterior.attrs
+
+    sites = sites_of(posterior)
     needed = ("B0", "B") if "B0" in sites else ("beta0", "beta", "b", "delta_w", "delta_v")
-    if missing := [name for name in needed if name not in sites]:
+    missing = [name for name in needed if name not in sites]
+    if missing:
         raise TrustboError(
             f"the posterior has no variable {missing[0]!r}, only {', '.join(sites)}. Give a "
             "posterior from trustbo.fit with unchanged names."
         )
-    x0 = {name: attrs[name] for name in ("x0_mean", "x0_sd")}
+
+    x0 = {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")}
+    memory = posterior.attrs.get("memory", "level")
     maps = {}
     if "places" in posterior.children:
         maps = place_maps_of(posterior["places"].to_dataset(), sites)
@@ -154,7 +169,7 @@ def _read_params(
     found = []
     for day in days:
         ahead = sites | _robot_effects_ahead(posterior, sites, day)
-        params = assemble_params(ahead, x0, attrs.get("memory", "level"))
+        params = assemble_params(ahead, x0, memory)
         found.append(params._replace(**maps))  # pyright: ignore
     return found
 
@@ -166,23 +181,29 @@ def _robot_effects_ahead(
     effects = [e for e in effects_of(posterior) if not isinstance(e, PlaceEffect)]
     if not effects:
         return {}
+
     theta = theta_of(posterior, sites)
     rng = np.random.default_rng(_DAY_SEED) if day else None
-    robots = (len(theta["inverse_gain"]), posterior.attrs["n_robots"])
-    n = posterior.attrs["n_missions"]
-    slopes = [effect.ahead(values_of(posterior, effect), theta, n, rng) for effect in effects]
-    slope = np.broadcast_to(sum(slopes), robots)
+    n_draws = len(theta["inverse_gain"])
+    n_robots = posterior.attrs["n_robots"]
+    n_missions = posterior.attrs["n_missions"]
+    slopes = [
+        effect.ahead(values_of(posterior, effect), theta, n_missions, rng) for effect in effects
+    ]
+    slope = np.broadcast_to(sum(slopes), (n_draws, n_robots))
 
+    # Robot effects act on line of sight, or on the intercept if it is not among the features.
     features = posterior["posterior"].to_dataset()["feature"].values.tolist()
     sight = [m for m, name in enumerate(features) if is_line_of_sight(name)]
-    weights = np.zeros((*robots, len(features)))
+    weights = np.zeros((n_draws, n_robots, len(features)))
     if sight:
         weights[:, :, sight] = slope[..., None] / len(sight)
-        slope = np.zeros(robots)
+        slope = np.zeros((n_draws, n_robots))
 
-    b = sites["b"].reshape(robots[0], -1) + slope
+    b = sites["b"].reshape(n_draws, -1) + slope
     if "B0" in sites:
-        B, robot = sites["B"].copy(), np.arange(robots[1])
+        B = sites["B"].copy()
+        robot = np.arange(n_robots)
         B[:, :, robot, robot] += np.swapaxes(weights, 1, 2)
         return {"b": b, "B": B}
     beta = sites["beta"] if sites["beta"].ndim == 3 else sites["beta"][:, None]
@@ -204,12 +225,13 @@ def in_order_of(
 
     Parameters that all robots share apply to any robots. Raises TrustboError if names differ.
     """
+    is_shared = "robot" not in posterior["posterior"].dims and "robots" not in posterior.children
     order = {}
     for axis, names in {"feature": list(features), "robot": list(robots)}.items():
         have = list(names_in(posterior, axis))
-        shared = "robot" not in posterior["posterior"].dims and "robots" not in posterior.children
-        if have == names or not have or (axis == "robot" and shared):
+        if have == names or not have or (axis == "robot" and is_shared):
             continue
+
         if sorted(have) != sorted(names):
             raise TrustboError(
                 f"the posterior has the {axis}s {', '.join(have)}, not {', '.join(names)}; fit "
@@ -218,8 +240,9 @@ def in_order_of(
         order[axis] = names
     if not order:
         return posterior
+
     if "robot" in order:
-        order["robot_"] = order["robot"]
+        order["robot_"] = order["robot"]  # second axis of a matrix (robot, robot)
 
     def sort(group: xr.Dataset) -> xr.Dataset:
         return group.sel({axis: names for axis, names in order.items() if axis in group.indexes})
@@ -274,10 +297,12 @@ def read_posterior(
     require_same_team(missions)
     features = missions[0].features
     posterior = in_order_of(posterior, missions[0].robots, features)
+
     if model is None:
         model = model_from_record(json.loads(posterior.attrs["model_record"]), features=features)
     require_kind("model", model, TrustModel, "give the model of the posterior")
     model = model.for_features(features)
+
     fitted = Density(model, model.observations(missions))
     groups = {"posterior": sites_of(posterior)}
     groups |= {effect.group: values_of(posterior, effect) for effect in model.effects}
@@ -297,14 +322,18 @@ def sample_prior(
         n_robots: Number of robots, for models with separate parameters for each robot.
     """
     require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
-    n_draws, seed = require_count("n_draws", n_draws), require_whole("seed", seed, 0)
-    prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(seed)
+    n_draws = require_count("n_draws", n_draws)
+    seed = require_whole("seed", seed, 0)
+
+    prior = _prior(model, n_features, n_robots)
+    rng = np.random.default_rng(seed)
     return assemble_params(prior_parameters(prior, n_draws, rng), model.x0, model.memory)
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
     """Compute the prior mean of the parameters without effects; see `sample_prior`."""
-    prior, rng = _prior(model, n_features, n_robots), np.random.default_rng(0)
+    prior = _prior(model, n_features, n_robots)
+    rng = np.random.default_rng(0)
     sites = prior_parameters(prior, _N_MEAN, rng, even=True)
     sites = {name: values.mean(0, keepdims=True) for name, values in sites.items()}
     return assemble_params(sites, model.x0, model.memory)
@@ -312,11 +341,13 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
 
 def _prior(model: TrustModel, n_features: int, n_robots: int) -> Density:
     """Make a `Density` without data or effects."""
-    sizes = {"n_features": n_features, "n_robots": n_robots}
-    n_features, n_robots = (require_count(name, n) for name, n in sizes.items())
-    none = np.full((1, 1, n_robots), np.nan)
+    n_features = require_count("n_features", n_features)
+    n_robots = require_count("n_robots", n_robots)
+
+    unmeasured = np.full((1, 1, n_robots), np.nan)
     z = np.zeros((1, 1, n_robots, n_features))
-    return Density(replace(model, effects=()), Observations(none, z, none, ("",) * n_features))
+    observations = Observations(unmeasured, z, unmeasured, ("",) * n_features)
+    return Density(replace(model, effects=()), observations)
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:
@@ -326,24 +357,33 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
             "this posterior contains only parameters; give the fitted missions with missions=. "
             "For result.posteriors[j], they are result.missions[: j + 1]."
         )
+
     data = posterior["constant_data"].to_dataset()
     data = data.assign(contact_rate=posterior["observed_data"].to_dataset()["contact_rate"])
-    robots, features = ([str(n) for n in data[axis].values] for axis in ("robot", "feature"))
+    robots = [str(name) for name in data["robot"].values]
+    features = [str(name) for name in data["feature"].values]
+
     missions = []
     for j in range(data.sizes["mission"]):
         one = data.isel(mission=j)
-        made, path = one["row"].values >= 0, None
-        if made.any():
-            one = one.isel(bound=made)
+        was_made = one["row"].values >= 0
+        if was_made.any():
+            one = one.isel(bound=was_made)
             cells = zip(one["row"].values, one["col"].values, strict=True)
             path = [(int(one["start_row"]), int(one["start_col"])), *cells]
-        else:
+        else:  # a mission without a map
             one = one.isel(bound=slice(int(one["n_bounds"])))
-        z, y, seconds = (one[name].values for name in ("awareness", "contact_rate", "duration"))
-        status, ticks = str(one["status"].values), one["n_ticks"].values
-        missions.append(
-            Mission.from_arrays(
-                path, z, y, seconds, status, n_ticks=ticks, robots=robots, features=features
-            )
+            path = None
+
+        mission = Mission.from_arrays(
+            path,
+            one["awareness"].values,
+            one["contact_rate"].values,
+            one["duration"].values,
+            str(one["status"].values),
+            n_ticks=one["n_ticks"].values,
+            robots=robots,
+            features=features,
         )
+        missions.append(mission)
     return missions

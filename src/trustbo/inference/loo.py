@@ -4,11 +4,11 @@ With coefficients, effects and trust integrated out, only the hyperparameters th
 
     p(y_j | y_-j) = 1 / E[ p(y_-j | theta) / p(y | theta) | y ],
 
-so the importance weights are ratios of the evidence without and with mission j. If coefficients
-were not integrated out, the weights would be poor for bounds that occur only in mission j.
+so the importance weights are ratios of the evidence without and with mission j (Vehtari, Gelman and
+Gabry 2017). If coefficients were not integrated out, the weights would be poor for bounds that
+occur only in mission j.
 """
 
-import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -19,7 +19,7 @@ from arviz_stats.utils import ELPDData
 from scipy.special import logsumexp
 
 from trustbo.display import slow_bar
-from trustbo.errors import TrustboError, one_line
+from trustbo.errors import TrustboError, one_line, warn
 from trustbo.inference.density import Density, at
 from trustbo.inference.draws import missions_of, read_posterior, require_posterior
 from trustbo.inference.fit import by_importance
@@ -28,7 +28,10 @@ from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
 from trustbo.parallel import computing
 
-_POINTS = 500  # maximum number of distinct hyperparameter draws that are used
+_POINTS = 500
+"""Maximum number of distinct hyperparameter draws that are used."""
+_N_REFIT = 1000
+"""Number of draws of a refit without a mission."""
 
 
 @computing()
@@ -62,51 +65,63 @@ def loo(
     if len(measured) < 2:
         raise TrustboError(f"loo needs at least 2 missions with rates; got {len(measured)}.")
 
+    # Resampled draws repeat, and the evidence of each distinct draw is computed only once.
     rows = np.column_stack([v.reshape(len(draws.c), -1) for v in draws.theta.values()])
     _, first, count = np.unique(rows, axis=0, return_index=True, return_counts=True)
     some = np.linspace(0, len(first) - 1, min(len(first), _POINTS)).astype(int)
-    theta, log_count = at(draws.theta, first[some]), np.log(count[some] / count[some].sum())
+    theta = at(draws.theta, first[some])
+    log_count = np.log(count[some] / count[some].sum())
 
     whole = fitted.log_evidence(theta)
-    # `average` is the log of the mean density of each mission under the full posterior.
-    density, k_hat, average = np.zeros((3, len(measured)))
-    refitted, whole_refit = np.zeros(len(measured), dtype=bool), None
-    with slow_bar("loo", " missions", progress, total=len(measured)) as bar:
+    n_measured = len(measured)
+    density = np.zeros(n_measured)
+    average = np.zeros(n_measured)  # log of the mean density under the full posterior
+    k_hat = np.zeros(n_measured)
+    refitted = np.zeros(n_measured, dtype=bool)
+    whole_refit = None
+    with slow_bar("loo", " missions", progress, total=n_measured) as bar:
         for i, j in enumerate(measured):
             others = fitted.without(j)  # pyright: ignore[reportArgumentType]
             ratio = others.log_evidence(theta) - whole
             weight, k_hat[i], _ = smoothed(ratio + log_count)
             density[i] = logsumexp(-ratio, b=weight)
             average[i] = logsumexp(log_count - ratio)
+
+            # p(y_j | y_-j) = p(y) / p(y_-j), each from an own fit.
             if not k_hat[i] <= MAX_KHAT:
                 seed = int(posterior.attrs["seed"])
                 if whole_refit is None:
-                    whole_refit = _log_evidence(fitted, seed)
+                    whole_refit, _ = _log_evidence(fitted, seed)
                 rest, k_hat[i] = _log_evidence(others, seed)
-                density[i], refitted[i] = whole_refit[0] - rest, True
+                density[i] = whole_refit - rest
+                refitted[i] = True
             bar.update()
 
+    # Densities of tick counts are comparable between families; NaN where ticks are unknown.
     shift = fitted.model.family.log_resolution(
         fitted.observations.contact_rate, fitted.observations.n_ticks
     ).sum((1, 2))
     if not np.isnan(shift).any():
-        density, average = density + shift[measured], average + shift[measured]
-    coords = {"mission": measured, "refitted": ("mission", refitted)}
-    elpd, n, bad = float(density.sum()), len(density), ~(k_hat <= MAX_KHAT)
-    if bad.any():
-        warnings.warn(
+        density = density + shift[measured]
+        average = average + shift[measured]
+
+    is_bad = ~(k_hat <= MAX_KHAT)
+    if is_bad.any():
+        warn(
             f"Estimated shape parameter of Pareto distribution is greater than {MAX_KHAT:.2f} for "
-            f"missions {measured[bad].tolist()}; the results may be inaccurate.",
-            stacklevel=2,
+            f"missions {measured[is_bad].tolist()}; the results may be inaccurate."
         )
+
+    elpd = float(density.sum())
+    coords = {"mission": measured, "refitted": ("mission", refitted)}
     return ELPDData(
         elpd=elpd,
-        se=float(np.sqrt(n * density.var())),
+        se=float(np.sqrt(n_measured * density.var())),
         p=float(average.sum()) - elpd,
         n_samples=len(draws.c),
-        n_data_points=n,
+        n_data_points=n_measured,
         scale="log",
-        warning=bool(bad.any()),
+        warning=bool(is_bad.any()),
         good_k=MAX_KHAT,
         elpd_i=xr.DataArray(density, coords, "mission"),
         pareto_k=xr.DataArray(k_hat, coords, "mission"),
@@ -115,7 +130,7 @@ def loo(
 
 def _log_evidence(density: Density, seed: int) -> tuple[float, float]:
     """Compute the log evidence by importance sampling, and the k-hat of the weights."""
-    summary = by_importance(density, 1000, seed)[2]
+    _, _, summary = by_importance(density, _N_REFIT, seed)
     return summary["log_evidence"], summary["k_hat"]
 
 
@@ -144,13 +159,17 @@ def compare(posteriors: Mapping[str, xr.DataTree], *, progress: bool = True) -> 
             f"compare needs a dict of two or more posteriors by name; got {one_line(posteriors)}."
         )
     trees = {name: require_posterior("compare", tree) for name, tree in posteriors.items()}
-    (first, reference), *others = ((name, _rates_and_ticks(tree)) for name, tree in trees.items())
-    for name, data in others:
+
+    data_of = {name: _rates_and_ticks(tree) for name, tree in trees.items()}
+    first, *_ = data_of
+    reference = data_of[first]
+    for name, data in data_of.items():
         if not np.array_equal(reference, data, equal_nan=True):
             raise TrustboError(
                 f"{name!r} and {first!r} were fitted to different rates or tick counts, of shape "
                 f"{data.shape[1:]} and {reference.shape[1:]}; fit both to the same missions."
             )
+
     return ranked({name: loo(tree, progress=progress) for name, tree in trees.items()})
 
 

@@ -17,7 +17,16 @@ from trustbo.stacking import require_same_team
 from trustbo.statespace.blocks import each
 from trustbo.streams import stream
 
-_ALIKE = 16  # draws of a fitted person's trust for each draw of the population parameters
+_ALIKE = 16
+"""Draws of a fitted person's trust for each draw of the population parameters."""
+_JITTER = 1e-12
+"""Added to the covariance of a person's trust."""
+_LEAST_MASS = 1e-300
+"""Least probability of a report, whose logarithm is finite."""
+_CLOSE = 1e-12
+"""Rounding error of a cumulative probability."""
+_FINE = 1e6
+"""Answers are rounded to multiples of 1 / `_FINE`, so that rounding errors do not show."""
 
 
 @computing()
@@ -64,7 +73,9 @@ def predict_reports(
         )
     require_same_team(missions)
     require_choice("given", given, ("earlier", "none"))
-    seed, n = require_whole("seed", seed, 0), require_count("n_draws", n_draws)
+    seed = require_whole("seed", seed, 0)
+    n_draws = require_count("n_draws", n_draws)
+
     of_fit, draws = read_posterior(posterior, model=model)
     if missions[0].features != of_fit.observations.features:
         raise TrustboError(
@@ -72,19 +83,21 @@ def predict_reports(
             f"missions have {missions[0].features}; give missions with the same inputs as the "
             "posterior."
         )
-    levels = levels_of(posterior.attrs["scale"])
     ahead = Density(of_fit.model, of_fit.model.observations(missions))
-    copies = _ALIKE if fitted else 1
-    some = np.unique(np.linspace(0, len(draws.c) - 1, max(1, n // copies)).astype(int))
-    draws = draws.at(np.repeat(some, copies))
 
+    # Earlier reports of a fitted person reweight only the copies of each draw among themselves.
+    copies = _ALIKE if fitted else 1
+    some = np.unique(np.linspace(0, len(draws.c) - 1, max(1, n_draws // copies)).astype(int))
+    draws = draws.at(np.repeat(some, copies))
+    alike = _ALIKE if fitted else len(some)
+
+    levels = levels_of(posterior.attrs["scale"])
     shape = ahead.observations.contact_rate.shape
     out = {name: np.full(shape, np.nan) for name in ("mean", "log_score")}
     out["quantile"] = np.full((*shape, len(QUANTILES)), np.nan)
     if levels:
         out["probability"] = np.full((*shape, levels), np.nan)
     for j, mission in enumerate(missions):
-        alike = _ALIKE if fitted else len(some)
         rng = stream(seed, "reports", j)
         person = _of_person(ahead, draws, j, given == "earlier", alike, rng)
         for (k, i), weight, center, var in person:
@@ -92,11 +105,11 @@ def predict_reports(
                 found = _prediction(ahead, (j, k, i), weight, center, var, draws, levels, rng)
                 for name, value in found.items():
                     out[name][j, k, i] = value
+
     for name in ("mean", "quantile"):
         out[name] = _answer_of(out[name], levels)
-    return _dataset(
-        _answer_of(ahead.observations.contact_rate, levels), out, levels, missions[0].robots
-    )
+    report = _answer_of(ahead.observations.contact_rate, levels)
+    return _dataset(report, out, levels, missions[0].robots)
 
 
 def _of_person(
@@ -107,22 +120,32 @@ def _of_person(
     The person's trust is drawn row by row given the reports so far. Each run of `alike` draws has
     the same total weight.
     """
-    observations, family = ahead.observations, ahead.model.family
+    observations = ahead.observations
+    family = ahead.model.family
+    sd = draws.theta["delta_v"]
     _, n_bounds, n_robots = observations.contact_rate.shape
-    mean, root = [], []
+    y = observations.contact_rate[j].ravel()
+    ticks = observations.n_ticks[j].ravel()
+
+    # Trust of the person in each draw is normal, with this mean and root of the covariance.
+    means = []
+    roots = []
     for _, _, predictor, of_all in predictors(ahead, draws):
-        mean.append(of_all[:, j])
+        means.append(of_all[:, j])
         cov = each(predictor.covariance, ahead.blocks.label)
         cov = np.broadcast_to(cov, (len(of_all), *cov.shape[1:]))[:, j % cov.shape[1]]
-        root.append(np.linalg.cholesky(cov + 1e-12 * np.eye(cov.shape[-1])))
-    mean, root, sd = np.concatenate(mean), np.concatenate(root), draws.theta["delta_v"]
-    y, ticks = (a[j].ravel() for a in (observations.contact_rate, observations.n_ticks))
-    white, log_weight = np.zeros(mean.shape), np.zeros(len(mean))
+        roots.append(np.linalg.cholesky(cov + _JITTER * np.eye(cov.shape[-1])))
+    mean = np.concatenate(means)
+    root = np.concatenate(roots)
+
+    white = np.zeros(mean.shape)
+    log_weight = np.zeros(len(mean))
     for k in range(n_bounds):
         runs = log_weight.reshape(-1, alike)
         weight = np.exp(runs - np.logaddexp.reduce(runs, axis=1, keepdims=True)).ravel()
+        known = k * n_robots if earlier else 0  # rows of the reports that may be used
         for i in range(n_robots):
-            r, known = k * n_robots + i, k * n_robots * earlier
+            r = k * n_robots + i
             center = mean[:, r] + (root[:, r, :known] * white[:, :known]).sum(1)
             var = (root[:, r, known : r + 1] ** 2).sum(1)
             yield (k, i), weight / len(runs), center, var
@@ -133,7 +156,8 @@ def _of_person(
             white[:, r] = rng.standard_normal(len(mean))
             if earlier and not np.isnan(y[r]):
                 f, log_mass = family.draw(y[r], ticks[r], a, d**2, sd, rng)
-                white[:, r], log_weight = (f - a) / d, log_weight + log_mass
+                white[:, r] = (f - a) / d
+                log_weight = log_weight + log_mass
 
 
 def _prediction(
@@ -147,22 +171,29 @@ def _prediction(
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     """Predict a report given trust ~ N(center, var) in each draw, with weights (draw,)."""
-    family, sd = ahead.model.family, draws.theta["delta_v"]
-    y, ticks = ahead.observations.contact_rate[slot], ahead.observations.n_ticks[slot]
+    family = ahead.model.family
+    sd = draws.theta["delta_v"]
+    y = ahead.observations.contact_rate[slot]
+    ticks = ahead.observations.n_ticks[slot]
+
     found: dict[str, Any] = {}
     if not np.isnan(y):
-        mass = weight @ np.exp(family.match(y, ticks, center, var, sd)[0])
-        found["log_score"] = np.log(max(mass, 1e-300))
-    if levels:
+        log_mass, _, _ = family.match(y, ticks, center, var, sd)
+        found["log_score"] = np.log(max(weight @ np.exp(log_mass), _LEAST_MASS))
+
+    if levels:  # the probability of each answer is known
         answers = np.arange(levels) / (levels - 1.0)
-        many = [family.match(a, ticks, center, var, sd)[0] for a in answers]
-        mass = weight @ np.exp(np.stack(many, axis=1))
-        mass = np.maximum(mass, 1e-300) / mass.sum()
-        which = np.searchsorted(np.cumsum(mass) - 1e-12, QUANTILES)
+        log_masses = [family.match(answer, ticks, center, var, sd)[0] for answer in answers]
+        mass = weight @ np.exp(np.stack(log_masses, axis=1))
+        mass = np.maximum(mass, _LEAST_MASS) / mass.sum()
+        which = np.searchsorted(np.cumsum(mass) - _CLOSE, QUANTILES)
         quantile = answers[np.minimum(which, levels - 1)]
         return found | {"mean": mass @ answers, "quantile": quantile, "probability": mass}
+
+    # Otherwise, draw a report from each draw of trust, for weighted quantiles.
     trust = center + np.sqrt(var) * rng.standard_normal(len(var))
     drawn = family.sample(trust, sd, ticks, rng)
+
     order = np.argsort(drawn)
     which = np.searchsorted(np.cumsum(weight[order]), QUANTILES)
     quantile = drawn[order][np.minimum(which, len(drawn) - 1)]
@@ -177,6 +208,7 @@ def _dataset(
     dims = ("mission", "bound", "robot")
     variables = {"report": (dims, report)}
     variables |= {name: ((*dims, *axes.get(name, ())), values) for name, values in out.items()}
+
     coords: dict[str, Any] = {
         "mission": np.arange(len(report)),
         "bound": np.arange(1, report.shape[1] + 1),
@@ -185,16 +217,20 @@ def _dataset(
     }
     if levels:
         coords["answer"] = np.arange(1, levels + 1)
-    seen = ~np.isnan(report)
-    low, middle, high = (out["quantile"][..., i][seen] for i in (0, 2, 4))
-    attrs: dict[str, Any] = {"n": int(seen.sum())}
-    if seen.any():
-        attrs["mae"] = float(np.abs(report[seen] - middle).mean())
-        attrs["mean_log_score"] = float(out["log_score"][seen].mean())
-        attrs["coverage_90"] = float(((low <= report[seen]) & (report[seen] <= high)).mean())
+
+    is_given = ~np.isnan(report)
+    y = report[is_given]
+    low, _, median, _, high = (out["quantile"][..., i][is_given] for i in range(len(QUANTILES)))
+    attrs: dict[str, Any] = {"n": len(y)}
+    if len(y):
+        attrs["mae"] = float(np.abs(y - median).mean())
+        attrs["mean_log_score"] = float(out["log_score"][is_given].mean())
+        attrs["coverage_90"] = float(((low <= y) & (y <= high)).mean())
     return xr.Dataset(variables, coords, attrs)
 
 
 def _answer_of(report: Any, levels: int) -> Any:
     """Convert reports in [0, 1] to answers from 1 to `levels`, if there are levels."""
-    return np.round(report * (levels - 1.0) * 1e6) / 1e6 + 1.0 if levels else report
+    if not levels:
+        return report
+    return np.round(report * (levels - 1.0) * _FINE) / _FINE + 1.0

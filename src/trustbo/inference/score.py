@@ -1,4 +1,4 @@
-"""NormalScores of contact rates that were predicted before a mission."""
+"""Scores of contact rates that were predicted before a mission."""
 
 from collections.abc import Sequence
 
@@ -17,6 +17,7 @@ from trustbo.streams import stream
 from trustbo.workspace import Workspace
 
 INTERVALS = {"coverage_50": 0.5, "coverage_90": 0.9}
+"""Share of rates that the central interval of each summary should contain."""
 _DIMS = ("mission", "bound", "robot")
 
 
@@ -57,49 +58,57 @@ def score(
     """
     require_whole("seed", seed, 0)
     missions = require_list("missions", missions, Mission, "give a list of missions")
+
     known = range(len(missions))
     if workspace is not None:
         require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
         missions = [workspace.fill(mission) for mission in missions]
         known = known_awareness(missions)
+
     trees, indices = predictions("score", posterior, missions, known)
     if not trees:
         raise TrustboError(
             f"score needs a mission that an earlier posterior predicts; none of {len(missions)} "
             "missions has one. Run more missions."
         )
+
     missions = [missions[j] for j in indices]
     observations = Observations.from_missions(missions)
     y = observations.contact_rate
-    names = missions[0].robots, missions[0].features  # the same for all
-    trust = _follow(in_order_of(trees[0], *names))
+    robots = missions[0].robots  # the same for all missions, as are the features
+    features = missions[0].features
+    trust = _follow(in_order_of(trees[0], robots, features))
+
     columns = {name: np.full(y.shape, np.nan) for name in ("mean", "pit", "log_score")}
     quantile = np.full((*y.shape, len(QUANTILES)), np.nan)
     for j, (tree, mission) in enumerate(zip(trees, missions, strict=True)):
-        if j and tree is not trees[j - 1]:
-            trust = _follow(in_order_of(tree, *names))
+        if j > 0 and tree is not trees[j - 1]:
+            trust = _follow(in_order_of(tree, robots, features))
 
         require_ticks(trust.family, y, observations.n_ticks)
         k = slice(len(mission.bounds))
         rng = stream(seed, "score", j)
         ticks = observations.n_ticks[j, k]
+
         columns["log_score"][j, k], drawn = _predict(trust, mission, y[j, k], ticks, rng)
         columns["mean"][j, k] = np.where(np.isnan(y[j, k]), np.nan, drawn.mean(0))
         columns["pit"][j, k] = _pit(drawn, y[j, k], rng)
         quantile[j, k] = np.moveaxis(np.quantile(drawn, QUANTILES, axis=0), 0, -1)
     quantile[np.isnan(y)] = np.nan
 
+    # Scores of tick counts are comparable between families; NaN where ticks are unknown.
     attrs = {"log_score_of": "contact_rate"}
     shift = trust.family.log_resolution(y, observations.n_ticks)
     if not np.isnan(shift).any():
         columns["log_score"] += shift
         attrs["log_score_of"] = "ticks"
+
     variables = {"contact_rate": (_DIMS, y), "quantile": ((*_DIMS, "level"), quantile)}
     variables |= {name: (_DIMS, column) for name, column in columns.items()}
     coords = {
         "mission": indices,
         "bound": np.arange(1, y.shape[1] + 1),
-        "robot": list(missions[0].robots),
+        "robot": list(robots),
         "level": list(QUANTILES),
     }
     return xr.Dataset(variables | _summary(y, **columns), coords, attrs)
@@ -120,6 +129,7 @@ def _predict(
     """Return log densities (bound, robot) and draws (draw, bound, robot) of the rates."""
     z = mission.awareness
     path = mission.path[: len(z) + 1] if trust.params.places and mission.path else None
+
     counts = trust.space.grouped(ticks)
     ahead = kalman.forecast(
         trust.space, trust.start(), trust.inputs(z, path), counts, trust.family, rng
@@ -131,6 +141,8 @@ def _predict(
         of_rates = kalman.marginal_log_densities(
             trust.space, belief, trust.space.grouped(y[k]), counts[k], trust.family
         )
+
+        # Log of the mean density over the draws of the parameters.
         density = np.logaddexp.reduce(of_rates, axis=0) - np.log(len(rates))
         log_scores[k] = np.where(np.isnan(y[k]), np.nan, density)
         drawn.append(rates)
@@ -141,18 +153,24 @@ def _summary(
     contact_rate: np.ndarray, mean: np.ndarray, pit: np.ndarray, log_score: np.ndarray
 ) -> dict[str, float]:
     """Compute the coverage, the mean log score, R2 and the number of measured rates."""
-    kept = np.isfinite(contact_rate)
-    y, n = contact_rate[kept], int(kept.sum())
-    if not n:
+    is_measured = np.isfinite(contact_rate)
+    n = int(is_measured.sum())
+    if n == 0:
         return dict.fromkeys((*INTERVALS, "mean_log_score", "r2"), np.nan) | {"n": 0}
-    spread = ((y - y.mean()) ** 2).sum()
+
+    # A rate is in the central interval if its PIT is as close to 0.5.
     within = {
-        name: float((np.abs(pit[kept] - 0.5) <= 0.5 * share).mean())
+        name: float((np.abs(pit[is_measured] - 0.5) <= 0.5 * share).mean())
         for name, share in INTERVALS.items()
     }
-    r2 = 1.0 - ((y - mean[kept]) ** 2).sum() / spread if spread > 0.0 else np.nan
-    log_scores = float(log_score[kept].mean())
-    return within | {"mean_log_score": log_scores, "r2": float(r2), "n": n}
+    mean_log_score = float(log_score[is_measured].mean())
+
+    y = contact_rate[is_measured]
+    spread = ((y - y.mean()) ** 2).sum()
+    r2 = np.nan
+    if spread > 0.0:
+        r2 = float(1.0 - ((y - mean[is_measured]) ** 2).sum() / spread)
+    return within | {"mean_log_score": mean_log_score, "r2": r2, "n": n}
 
 
 def predictions(
@@ -182,15 +200,19 @@ def predictions(
     """
     if not missions:
         raise TrustboError(f"{who} needs missions to predict; got none.")
-    known = range(len(missions)) if known is None else known
+    if known is None:
+        known = range(len(missions))
+
     if isinstance(posterior, xr.DataTree) or not isinstance(posterior, Sequence):
         return [require_posterior(who, posterior)] * len(known), list(known)
+
     last = last_posterior(who, posterior)
     if not len(missions) - 1 <= len(posterior) <= len(missions):
         raise TrustboError(
             f"got {len(posterior)} posteriors and {len(missions)} missions; give the posterior "
             "after each mission, as in Result.posteriors."
         )
+
     used = np.intersect1d(known, last.attrs.get("missions", known))
     pairs = [
         (require_posterior(who, tree), j)
@@ -213,6 +235,9 @@ def last_posterior(who: str, posteriors: Sequence[xr.DataTree | None]) -> xr.Dat
 
 def _pit(drawn: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Compute the randomised PIT of rates (bound, robot) among draws (draw, bound, robot)."""
-    below, equal = (drawn < y).sum(0), (drawn == y).sum(0)
+    below = (drawn < y).sum(0)
+    equal = (drawn == y).sum(0)
+
+    # The rank of y among the draws, at random among equal ones.
     pit = (below + rng.random(y.shape) * (equal + 1.0)) / (len(drawn) + 1.0)
     return np.where(np.isnan(y), np.nan, pit)
