@@ -20,7 +20,10 @@ from trustbo.statespace import Inputs, kalman
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import bounds_along, require_on_grid
 
-_TICKS = 200.0  # number of ticks assumed for a future bound
+_TICKS = 200.0
+"""Number of ticks assumed for a future bound."""
+_BAND = (0.05, 0.95)
+"""Quantiles of predicted contact rates."""
 Effect = np.ndarray | float
 """Place effect of a bound, an array (draw, robot or 1) or a number."""
 
@@ -100,6 +103,7 @@ class TrustFilter:
         self._names: dict[str, Names | None] = {"robot": None, "feature": None}
         if workspace is not None:
             self._names = {"robot": workspace.team.names, "feature": workspace.features}
+
         if isinstance(posterior, xr.DataTree):
             require_posterior("TrustFilter", posterior)
             if "constant_data" in posterior.children:  # without a map, any awareness is valid
@@ -115,16 +119,19 @@ class TrustFilter:
                 f"{one_line(posterior)}. A campaign has no posterior before the first mission; "
                 "use the `belief` of the campaign instead."
             )
-        n_robots = posterior.n_robots if n_robots is None else n_robots
+
+        if n_robots is None:
+            n_robots = posterior.n_robots
         if n_robots is None:
             raise TrustboError("TrustParams do not contain the number of robots; give n_robots.")
         self._n_robots = require_whole("n_robots", n_robots, 1)
         self._n_features = posterior.n_features
         check_params(posterior, self._n_robots, self._n_features)
+
         flat = posterior.flat()
-        n = len(flat.b)
-        most = require_whole("max_draws", max_draws, 1)
-        kept = np.linspace(0, n - 1, min(n, most)).astype(int)
+        n_draws = len(flat.b)
+        max_draws = require_whole("max_draws", max_draws, 1)
+        kept = np.linspace(0, n_draws - 1, min(n_draws, max_draws)).astype(int)
         self.params: Params = flat.draw(kept)
         self.family = FAMILIES[observation]
         self.space = self.params.state_space(self._n_robots, adds_noise=self.family.adds_noise)
@@ -175,24 +182,30 @@ class TrustFilter:
                 missing, off the grid or between cells that are not neighbours.
         """
         z = self._checked(awareness, 2)
-        inputs = self.inputs(z[None], bound)[0]
+        [inputs] = self.inputs(z[None], bound)
+
         y = self._of_robots("contact_rate", contact_rate)
         if y.shape != (self._n_robots,):
             raise TrustboError(f"contact_rate must have shape ({self._n_robots},); got {y.shape}.")
         require_unit_interval("contact_rate", y)
+
         ticks = self._of_robots("n_ticks", np.nan if n_ticks is None else n_ticks)
-        ticks = ticks if ticks.ndim else np.full(y.shape, ticks)
+        if ticks.ndim == 0:
+            ticks = np.full(y.shape, ticks)
         require_shares(y, ticks)
         if self.family.needs_ticks and (np.isnan(ticks) & ~np.isnan(y)).any():
             raise TrustboError(NO_TICKS)
+
         predicted = kalman.predict(self.space, self._belief, inputs)
         rates = self.space.grouped(y)
         counts = self.space.grouped(ticks)
-        updated = kalman.update(self.space, predicted, rates, counts, self.family)
-        self._belief, gained = updated
+        self._belief, gained = kalman.update(self.space, predicted, rates, counts, self.family)
+
+        # Draws that predicted the rates better get more weight.
         self._log_weight = self._log_weight + gained  # a new array, as copies share the old one
         weights = np.exp(self._log_weight - self._log_weight.max())
         self.weights = weights / weights.sum()
+
         self.n_bounds += 1
         return self.state
 
@@ -211,18 +224,20 @@ class TrustFilter:
                 [0, 1]; or the path is missing, has the wrong length, jumps or leaves the grid.
         """
         given = self._checked(awareness, 3)
-        rng = np.random.default_rng(self.n_bounds)
+        rng = np.random.default_rng(self.n_bounds)  # so that a repeated prediction is the same
+
         inputs = self.inputs(given, path)
         ticks = self.space.grouped(np.full(given.shape[:2], _TICKS))
         ahead = kalman.forecast(self.space, self._belief, inputs, ticks, self.family, rng)
-        trust, rates = [], []
+        trust = []
+        rates = []
         for belief, drawn in ahead:
             trust.append(_average(belief, self.weights))
             rates.append(drawn)
 
         draws = np.stack(rates, axis=1)[systematic(self.weights, len(self.weights), rng)]
         mean, sd = (np.stack(column) for column in zip(*trust, strict=True))
-        low, high = np.quantile(draws, (0.05, 0.95), axis=0)
+        low, high = np.quantile(draws, _BAND, axis=0)
         return TrustForecast(mean, sd, draws.mean(0), low, high, draws)
 
     def inputs(self, awareness: np.ndarray, path: Sequence[Cell] | None) -> list[Inputs]:
@@ -246,6 +261,7 @@ class TrustFilter:
         places = self.params.places
         if path is None and not places:
             return [0.0] * n_bounds
+
         given = path if isinstance(path, Iterable) else []
         cells = [require_pair("a cell", cell) for cell in given]
         if len(cells) != n_bounds + 1:
@@ -255,7 +271,8 @@ class TrustFilter:
             )
         for grid in {np.shape(value)[-2:] for value in places.values()}:
             require_on_grid(cells, grid)
-        bounds = bounds_along(cells)
+        bounds = bounds_along(cells)  # refuses a path that jumps
+
         if not places:
             return [0.0] * n_bounds
         return list(np.moveaxis(self.params.of_places(bounds), -2, 0))
@@ -270,10 +287,12 @@ class TrustFilter:
         z = read_labelled("awareness", awareness, dims, self._names).values
         expected = (self._n_robots, self._n_features)
         if z.ndim != n_axes or z.shape[-2:] != expected or not len(z):
+            first = "bound, " if n_axes == 3 else ""
             raise TrustboError(
-                f"the shape of awareness must be {'(bound, ' if n_axes == 3 else '('}"
-                f"{expected[0]} robots, {expected[1]} features); got shape {z.shape}."
+                f"the shape of awareness must be ({first}{self._n_robots} robots, "
+                f"{self._n_features} features); got shape {z.shape}."
             )
+
         if np.isnan(z).any():
             raise TrustboError(
                 "awareness must not be NaN; replace unmeasured values with those of the map, "
@@ -289,5 +308,7 @@ def _average(belief: kalman.Belief, weights: np.ndarray) -> TrustState:
     """Compute the mean and standard deviation of trust over weighted draws."""
     mean = belief.mean.reshape(len(weights), -1)
     var = np.diagonal(belief.cov, axis1=2, axis2=3).reshape(mean.shape)
+
     center = weights @ mean
-    return TrustState(center, np.sqrt(weights @ (var + (mean - center) ** 2)))
+    total = weights @ (var + (mean - center) ** 2)  # within and between draws
+    return TrustState(center, np.sqrt(total))

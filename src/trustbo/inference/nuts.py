@@ -28,15 +28,24 @@ from trustbo.inference.diagnostics import complaints_of
 from trustbo.models.backend import namespace, own_settings
 from trustbo.streams import stream
 
-_POINTS = 2000  # resampled points to which the coordinates are fitted
-_WARMUP = {True: 150, False: 300}
-"""Warm-up draws that tune only a step size, and those that also tune a mass matrix."""
-_ACCEPT = 0.9  # target of the acceptance probability
-_DEPTH = 3  # most doublings of a trajectory, after which it has 7 steps
-_FIRST_STEP = 0.4  # step size at which warm-up starts, in sds
-_RIDGE = 1e-6  # added to the covariance of the points
-_SHRINK = 0.01  # penalty of the shape of a marginal, in nats per point
-_SLOPE_STEP = 1e-4  # step of the finite differences at the starts of the chains
+_POINTS = 2000
+"""Number of resampled points to which the coordinates are fitted."""
+_WARMUP_OF_STEP = 150
+"""Number of warm-up draws that tune only a step size."""
+_WARMUP_OF_MASS = 300
+"""Number of warm-up draws that also tune a mass matrix."""
+_ACCEPT = 0.9
+"""Target of the acceptance probability."""
+_DEPTH = 3
+"""Most doublings of a trajectory, after which it has 7 steps."""
+_FIRST_STEP = 0.4
+"""Step size at which warm-up starts, in sds."""
+_RIDGE = 1e-6
+"""Added to the covariance of the points."""
+_SHRINK = 0.01
+"""Penalty of the shape of a marginal, in nats per point."""
+_SLOPE_STEP = 1e-4
+"""Step of the finite differences at the starts of the chains."""
 _FIELDS = {
     "num_steps": "n_steps",
     "diverging": "diverging",
@@ -131,13 +140,16 @@ def sample_by_nuts(
         Draws with chains joined, statistics (draw,) by name, diagnostics and a list of failed
         checks.
     """
+    if warmup is None:
+        warmup = _WARMUP_OF_STEP if density.exact else _WARMUP_OF_MASS
+
     rng = stream(seed, "nuts")
-    warmup = _WARMUP[density.exact] if warmup is None else warmup
     points = importance.sample(
         density.log_density, density.start()[None], rng, defensive=density.defensive
     )
     z = points.z[points.resample(_POINTS, rng)]
     coordinates = Whitened.of(z)
+
     with own_settings():
         if density.exact:
             kernel = _marginal_kernel(density, coordinates)
@@ -145,27 +157,32 @@ def sample_by_nuts(
             if chains == 1:  # NumPyro expects no axis of chains
                 starts = jax.tree.map(lambda values: values[0], starts)
         else:
-            kernel, starts = _full_kernel(density, z), None
+            kernel = _full_kernel(density, z)
+            starts = None
+
         mcmc = MCMC(
             kernel, num_warmup=warmup, num_samples=draws, num_chains=chains,
             chain_method="vectorized", progress_bar=progress,
         )  # fmt: skip
         mcmc.run(jax.random.key(seed), init_params=starts, extra_fields=tuple(_FIELDS))
+
         fields = {name: np.asarray(v) for name, v in mcmc.get_extra_fields().items()}
         samples: Any = jax.tree.map(np.asarray, mcmc.get_samples())
+
     stats = {ours: fields[theirs] for theirs, ours in _FIELDS.items()}
-    stats["lp"] = -stats["lp"]
+    stats["lp"] = -stats["lp"]  # NumPyro's potential is -log density
+    resolution = density.observations.resolution
     if density.exact:
         z, log_jacobian = coordinates.scores(samples)
         stats["lp"] = stats["lp"] - log_jacobian
         values = density.scores.values(z)
-    else:
-        values = {name: samples[name] for name in density.scores.priors}
-    theta = density.model.theta(values, density.observations.resolution)
-    if density.exact:
+        theta = density.model.theta(values, resolution)
         drawn = Draws(theta, density.draw_columns(theta, rng))
     else:
+        values = {name: samples[name] for name in density.scores.priors}
+        theta = density.model.theta(values, resolution)
         drawn = Draws(theta, samples["columns"], samples["linear_predictor"])
+
     by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
     found, complaints = complaints_of(by_chain, stats["diverging"])
     return drawn, stats, found, complaints
@@ -207,4 +224,4 @@ def _full_kernel(density: Density, z: np.ndarray) -> NUTS:
     def program() -> None:
         density.model.program(density.observations)
 
-    return NUTS(program, init_strategy=init_to_value(values=center), target_accept_prob=0.9)
+    return NUTS(program, init_strategy=init_to_value(values=center), target_accept_prob=_ACCEPT)

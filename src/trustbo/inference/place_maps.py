@@ -21,11 +21,20 @@ from trustbo.models.effects.place import matern
 from trustbo.models.visited import Visited
 from trustbo.workspace.moves import MOVE_NAMES
 
-_STEP = 0.1  # step of log length scales
-_LARGEST = 4.0  # largest length scale, in units of the grid's longer side
-_REACH = 5.0  # distance in length scales at which the correlation is 0.002
-_JITTER = 1e-9  # added to the correlation matrix of visited cells
-_MAP = "row", "col"
+_STEP = 0.1
+"""Step of log length scales."""
+_LARGEST = 4.0
+"""Largest length scale, in units of the grid's longer side."""
+_REACH = 5.0
+"""Distance in length scales at which the correlation is 0.002."""
+_JITTER = 1e-9
+"""Added to the correlation matrix of visited cells."""
+_FIRST_SEED = 1000
+"""Seed of the length scale 1; steps of the scale may be negative, seeds may not."""
+_CELL = ("row", "col")
+"""Axes of a cell."""
+_BOUND = ("move", "row", "col")
+"""Axes of a bound."""
 
 
 def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> xr.Dataset:
@@ -36,14 +45,17 @@ def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> 
         places: Visited places.
         seed: Random seed for the maps that `params_of` draws.
     """
-    variables = {"place": (("chain", "draw", "cell"), draws["place"])}
-    variables["place_bound"] = ("chain", "draw", "bound"), draws["place_bound"]
+    variables = {
+        "place": (("chain", "draw", "cell"), draws["place"]),
+        "place_bound": (("chain", "draw", "bound"), draws["place_bound"]),
+    }
+
     n_chains, n_draws = draws["place"].shape[:2]
     coords = {
         "chain": np.arange(n_chains),
         "draw": np.arange(n_draws),
-        **{f"cell_{name}": ("cell", places.cells[:, i]) for i, name in enumerate(_MAP)},
-        **{f"bound_{n}": ("bound", places.bounds[:, i]) for i, n in enumerate(("move", *_MAP))},
+        **{f"cell_{name}": ("cell", places.cells[:, i]) for i, name in enumerate(_CELL)},
+        **{f"bound_{name}": ("bound", places.bounds[:, i]) for i, name in enumerate(_BOUND)},
     }
     return xr.Dataset(variables, coords, {"shape": list(places.shape), "seed": seed})
 
@@ -59,19 +71,27 @@ def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[st
         Arrays place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The
         axis `effect` has length 1 because effects are common to all robots.
     """
-    (rows, cols), seed = (int(n) for n in group.attrs["shape"]), int(group.attrs["seed"])
-    s, e = (
-        group[name].transpose("chain", "draw", ...).values.reshape(-1, group.sizes[axis])
-        for name, axis in (("place", "cell"), ("place_bound", "bound"))
-    )  # (draw, cell) and (draw, bound)
-    cells = np.column_stack([group[f"cell_{name}"].values for name in _MAP])
+    rows, cols = (int(n) for n in group.attrs["shape"])
+    seed = int(group.attrs["seed"])
+
+    s = _by_draw(group, "place", "cell")
+    cells = np.column_stack([group[f"cell_{name}"].values for name in _CELL])
     place = _cells(s, cells, (rows, cols), sites, [seed, 0])
+
+    # Effects of bounds are independent, so only those of visited bounds are replaced.
     rng = np.random.default_rng([seed, 1])
     place_bound = rng.standard_normal((len(place), len(MOVE_NAMES), rows, cols))
     place_bound *= sites["tau_e"][:, None, None, None]
     _centre(place_bound)
-    place_bound[:, *(group[f"bound_{name}"].values for name in ("move", *_MAP))] = e
+    visited = tuple(group[f"bound_{name}"].values for name in _BOUND)
+    place_bound[:, *visited] = _by_draw(group, "place_bound", "bound")
     return {"place": place[:, None], "place_bound": place_bound[:, None]}
+
+
+def _by_draw(group: xr.Dataset, name: str, axis: str) -> np.ndarray:
+    """Return the effects (draw, place) of a variable with chains joined."""
+    ordered = group[name].transpose("chain", "draw", ...)
+    return ordered.values.reshape(-1, group.sizes[axis])
 
 
 def _cells(
@@ -83,14 +103,17 @@ def _cells(
 ) -> np.ndarray:
     """Draw the effect (draw, row, col) over the grid, given the effect s at visited cells."""
     flat = cells[:, 0] * shape[1] + cells[:, 1]
-    centre = np.zeros((len(s), shape[0] * shape[1]))
-    off = np.empty(centre.shape)
-    for step, rows, scale, weights in _kriging(sites["length_scale"], cells, shape):
-        rng = np.random.default_rng([*seed, step + 1000])
-        free = _prior(shape, scale, int(rows.sum()), rng) * sites["tau_s"][rows, None]
-        centre[rows] = s[rows] @ weights
-        off[rows] = free - free[:, flat] @ weights
-    return (centre + _centre(off)).reshape(-1, *shape)
+    mean = np.zeros((len(s), shape[0] * shape[1]))
+    off = np.empty(mean.shape)
+    for step, is_step, scale, weights in _kriging(sites["length_scale"], cells, shape):
+        rng = np.random.default_rng([*seed, step + _FIRST_SEED])
+        free = _prior(shape, scale, int(is_step.sum()), rng) * sites["tau_s"][is_step, None]
+
+        # Matheron's rule: s and a free draw are both kriged from the visited cells.
+        mean[is_step] = s[is_step] @ weights
+        off[is_step] = free - free[:, flat] @ weights
+
+    return (mean + _centre(off)).reshape(-1, *shape)
 
 
 def _kriging(
@@ -101,15 +124,19 @@ def _kriging(
     The weights (visited cell, grid cell) convert s at visited cells to the mean of s everywhere.
     """
     grid = np.indices(shape).reshape(2, -1).T
+
     # For larger length scales, the effects of all cells are nearly equal, and `_prior` is slow.
     length_scale = np.minimum(length_scale, _LARGEST * max(shape))
     steps = np.round(np.log(length_scale) / _STEP).astype(int)
+
     for step in np.unique(steps):
-        scale, weights = float(np.exp(_STEP * step)), np.zeros((len(cells), len(grid)))
-        cross = _correlation(cells, grid, scale)
+        scale = float(np.exp(_STEP * step))
+        weights = np.zeros((len(cells), len(grid)))
         if len(cells):
+            cross = _correlation(cells, grid, scale)
             K = _correlation(cells, cells, scale) + _JITTER * np.eye(len(cells))
             weights = cho_solve(cho_factor(K), cross)
+
         yield int(step), steps == step, scale, weights
 
 
@@ -123,11 +150,15 @@ def _prior(
     shape: tuple[int, int], length_scale: float, n: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Draw n random fields (n, cell) with unit variance over the grid."""
+    # Around the torus, cells are at least one grid and at least the reach apart.
     reach = int(_REACH * length_scale)
     torus = [int(fft.next_fast_len(max(2 * m, m + reach), real=True) or 2 * m) for m in shape]
+
+    # Eigenvalues of the circulant covariance (Dietrich and Newsam 1997).
     down, right = (np.minimum(np.arange(m), m - np.arange(m)) for m in torus)
     kernel = matern(np.hypot(down[:, None], right[None]), length_scale)
     spectrum = np.real(np.asarray(fft.rfft2(kernel), dtype=complex))
+
     white = fft.rfft2(rng.standard_normal((n, *torus)))
     field = fft.irfft2(np.sqrt(np.maximum(spectrum, 0.0)) * white, s=torus)
     return np.asarray(field)[:, : shape[0], : shape[1]].reshape(n, -1)
