@@ -9,9 +9,12 @@ from arviz_stats import sampling_diagnostics
 
 from trustbo.inference.draws import require_posterior
 
-MAX_RHAT, MIN_ESS = 1.01, 400.0
-"""Largest rank-normalised R-hat and smallest bulk effective sample size accepted from NUTS."""
-NUTS_NAMES = "r_hat", "ess_bulk", "divergences"
+MAX_RHAT = 1.01
+"""Largest rank-normalised R-hat accepted from NUTS."""
+MIN_ESS = 400.0
+"""Smallest bulk effective sample size accepted from NUTS."""
+NUTS_NAMES = ("r_hat", "ess_bulk", "divergences")
+"""Names of the diagnostics of NUTS."""
 
 
 def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
@@ -35,14 +38,19 @@ def complaints_of(
 ) -> tuple[dict[str, float], list[str]]:
     """Compute the NUTS diagnostics of draws (chain, draw, ...), and list the failed checks."""
     flat = {name: values.reshape(*values.shape[:2], -1) for name, values in draws.items()}
+
     # Parameters that are constant in the model have no diagnostics.
     free = {name: v[:, :, np.ptp(v, axis=(0, 1)) > 0.0] for name, v in flat.items()}
     tree = arviz_base.from_dict({"posterior": {n: v for n, v in free.items() if v.size}})
     sites = tree["posterior"].to_dataset()
-    r_hat, ess = sampling_diagnostics.rhat(sites), sampling_diagnostics.ess(sites, method="bulk")
-    worst = max(float(a.max()) for a in r_hat.data_vars.values())
-    least = min(float(a.min()) for a in ess.data_vars.values())
-    divergences, complaints = int(diverging.sum()), []
+
+    r_hat = sampling_diagnostics.rhat(sites)
+    ess = sampling_diagnostics.ess(sites, method="bulk")
+    worst = max(float(values.max()) for values in r_hat.data_vars.values())
+    least = min(float(values.min()) for values in ess.data_vars.values())
+    divergences = int(diverging.sum())
+
+    complaints = []
     if not worst <= MAX_RHAT:  # also true for NaN
         complaints.append(f"R-hat is {worst:.3f} (limit {MAX_RHAT})")
     if not least >= MIN_ESS:

@@ -77,7 +77,9 @@ class Blocks(NamedTuple):
         pair = np.zeros((n_inputs, n_inputs), dtype=int)
         pair[upper] = pair.T[upper] = np.arange(n_pairs)
 
-        entries, where, values = [], [], []
+        entries = []
+        where = []
+        values = []
         for g in range(len(kinds)):
             rows = (np.flatnonzero(kind == g)[:, None] * n_inputs + np.arange(n_inputs)).ravel()
             X = sparse.csr_array(U[rows].reshape(len(rows) // n_inputs, n_inputs * n_columns))

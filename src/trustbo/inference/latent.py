@@ -13,7 +13,8 @@ from trustbo.inference.factor import cholesky
 from trustbo.models.effects.effect import Theta
 from trustbo.statespace.blocks import LinearPredictor, each
 
-_PARTICLES = 4  # linear predictors drawn for each draw of the coefficients
+_PARTICLES = 4
+"""Number of linear predictors drawn for each draw of the coefficients."""
 
 
 class Latent(NamedTuple):
@@ -94,10 +95,13 @@ def _exact_trust(
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw trust given Gaussian rates; also return log-likelihoods (draw, block)."""
-    b, S = density.blocks, each(predictor.trust_cov, density.blocks.label)
+    b = density.blocks
+    S = each(predictor.trust_cov, b.label)
     W, log_sites = whiten(b, predictor, density.site_precision(predictor))
     off = b.y - mean
     w = (W[:, b.kind] @ off[..., None])[..., 0]
+
+    # The normal distribution of trust given the rates; its gain is S (V + 1 / lam)^-1 = S W' W.
     gain = S @ (np.swapaxes(W, 2, 3) @ W)
     root = _root(S - gain @ S)[:, b.kind]
     x = mean + (gain[:, b.kind] @ off[..., None])[..., 0]
@@ -114,15 +118,21 @@ def _ep_trust(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw trust given non-Gaussian rates by weighted particles; returns as `_exact_trust`."""
     joint = ep.Joint(density.blocks, predictor, density.prior(theta), density.terms)
-    sites = ep.log_evidence(joint, density.sites, SWEEPS)[1]
+    _, sites = ep.log_evidence(joint, density.sites, SWEEPS)
+
+    # Particles of the predictor f; the Gumbel noise chooses one by weight, for each block.
     drawn = [ep.draw_predictors(joint, mean, sites, rng) for _ in range(_PARTICLES)]
     f, log_w = (np.stack(part) for part in zip(*drawn, strict=True))
     chosen = np.argmax(log_w + rng.gumbel(size=log_w.shape), axis=0)
     f = np.take_along_axis(f, chosen[None, ..., None], axis=0)[0]
     log_p = logsumexp(log_w, axis=0) - np.log(_PARTICLES)
-    if predictor.shared_cov is None:
+
+    if predictor.shared_cov is None:  # the predictor is trust
         return f, log_p
-    V, S = (each(C, density.blocks.label) for C in (predictor.covariance, predictor.trust_cov))
+
+    # Trust given the predictor f = trust + shared noise.
+    V = each(predictor.covariance, density.blocks.label)
+    S = each(predictor.trust_cov, density.blocks.label)
     gain = np.swapaxes(np.linalg.solve(V, S), 2, 3)
     x = mean + (gain @ (f - mean)[..., None])[..., 0]
     return x + (_root(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p

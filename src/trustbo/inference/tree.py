@@ -258,7 +258,8 @@ def log_prior(fitted: Density, sites: Mapping[str, np.ndarray]) -> dict[str, np.
         fitted: Density of the model given missions.
         sites: Draws (draw, ...) of the parameters by name.
     """
-    model, priors = fitted.model, fitted.scores.priors
+    model = fitted.model
+    priors = fitted.scores.priors
     resolution = fitted.observations.resolution
     inverse_gain = model.derived(sites)["inverse_gain"]
 

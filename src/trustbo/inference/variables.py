@@ -11,19 +11,22 @@ from trustbo.models.effects.effect import Theta
 
 def named(density: Density, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
     """Return the variables of draws by group (`posterior` and one per effect) and name."""
-    model, theta = density.model, draws.theta
+    theta = draws.theta
     groups = {"posterior": _hyperparameters(density, theta)}
-    for effect, a, b in zip(model.columns, density.ends[:-1], density.ends[1:], strict=True):
-        named = effect.named(draws.c[:, a:b], theta, density.observations)
-        groups.setdefault(effect.group or "posterior", {}).update(named)
+    ends = zip(density.ends[:-1], density.ends[1:], strict=True)
+    for effect, (start, end) in zip(density.model.columns, ends, strict=True):
+        of_effect = effect.named(draws.c[:, start:end], theta, density.observations)
+        groups.setdefault(effect.group or "posterior", {}).update(of_effect)
     return groups
 
 
 def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:
     """Make draws from variables by group and name, as returned by `named`."""
-    sites, model = groups["posterior"], density.model
+    sites = groups["posterior"]
+    model = density.model
     theta = model.derived({n: sites[n] for n in model.dims | model.effect_dims if n in sites})
     theta = {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
+
     c = [
         effect.coefficients(groups[effect.group or "posterior"], theta, density.observations)
         for effect in model.columns
@@ -45,8 +48,10 @@ def prior_parameters(
 
     With `even`, hyperparameters are evenly spaced quantiles, and coefficients prior means.
     """
-    model, observations = density.model, density.observations
+    model = density.model
+    observations = density.observations
     theta = model.theta(density.scores.draw(n, rng, even=even), observations.resolution)
+
     weights = Prior.of([model.weights.prior(theta, observations)])
     c = weights.mean if even else weights.draw(rng)
     return {**_hyperparameters(density, theta), **model.weights.named(c, theta, observations)}
