@@ -201,10 +201,10 @@ def paper(given):
 @own_settings()
 def compared(data, n_seeds):
     """Print a row for each sampler and seed, then a table of medians and worst seeds."""
-    samplers = compiled_samplers(data)
-    runs = {name: [] for name in samplers}
-    print("sampler, seed: effective size, CPU seconds, divergences, means of", *NAMES)
-    for name, sample in samplers.items():
+    runs = {}
+    for name, sample in compiled_samplers(data):
+        runs[name] = []
+        print(f"{name}, seed: effective size, CPU seconds, divergences, means of", *NAMES)
         for seed in range(n_seeds):
             started = time.process_time()
             draws, n_divergent = sample(seed)
@@ -240,18 +240,15 @@ def effective_size(draws):
 
 
 def compiled_samplers(data):
-    """Samplers of the paper's model by name: ours, and those of the peers that are installed."""
+    """Yield names and samplers of the paper's model: the peers that are installed, then ours.
+
+    Each sampler is compiled when it is asked for, and has run once. Some peers change settings of
+    JAX, after which a sampler of NumPyro that was compiled before fails.
+    """
     # With explicit priors, as the default priors for line of sight are not those of the peers.
     model = PooledTrust(priors=Priors()).for_features(["line_of_sight", "slope"])
     z, y = (np.stack([getattr(m, name) for m in data]) for name in ("awareness", "contact_rate"))
 
-    def ours(seed):
-        fitted = tb.fit(data, model, seed=seed, whole=False)
-        draws = {name: fitted["posterior"][name].to_numpy() for name in NAMES}
-        return {**draws, "kish": fitted.attrs["kish"]}, 0
-
-    ours(10_000)
-    found = {}
     peers = {
         "numpyro_nuts": (model, data),
         "numpyro_latent": (z, y),
@@ -264,12 +261,20 @@ def compiled_samplers(data):
         except ImportError as error:
             print(f"{name}: skipped, {error}")
             continue
+
         started = time.process_time()
-        found |= peer.samplers(*inputs)
+        found = peer.samplers(*inputs)
         seconds = time.process_time() - started
         print(f"{name}: compiled and run once in {seconds:.0f} s", flush=True)
-    # NumPyro's samplers fail after a fit, which enters and leaves its settings of JAX.
-    return found | {"trustbo, importance sampling": ours}
+        yield from found.items()
+
+    def ours(seed):
+        fitted = tb.fit(data, model, seed=seed, whole=False)
+        draws = {name: fitted["posterior"][name].to_numpy() for name in NAMES}
+        return {**draws, "kish": fitted.attrs["kish"]}, 0
+
+    ours(10_000)
+    yield "trustbo, importance sampling", ours
 
 
 def memory(given):
