@@ -137,7 +137,7 @@ class Density:
         return Order.of(met, free, n_chains)
 
     def without(self, mission: int) -> "Density":
-        """Return the posterior without the data of one mission."""
+        """Return the density without the data of one mission."""
         other = Density(self.model, self.observations.without([mission]))
         if not self.exact:
             kept = ~np.isnan(other.terms.y)
@@ -155,8 +155,8 @@ class Density:
 
         log_p = np.full(len(z), -np.inf)
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
-            theta, some = self._possible(z)
-            log_p[some] = self.log_evidence(theta) + self.scores.log_prior(z[some])
+            theta, log_prior, some = self._possible(z)
+            log_p[some] = self.log_evidence(theta) + log_prior
         return np.where(np.isfinite(log_p), log_p, -np.inf)
 
     def visit(self, z: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Columns]:
@@ -168,17 +168,17 @@ class Density:
         deviation = np.zeros((n_points, _DEVIATIONS, n_columns))
 
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
-            theta, some = self._possible(z)
+            theta, log_prior, some = self._possible(z)
             for where, chunk in chunks(theta, self._n_at_once):
                 fit, prior = self._fit(chunk)
                 log_p[some[where]] = fit.log_p
                 mean[some[where]], deviation[some[where]] = columns_of(prior, fit, _DEVIATIONS, rng)
-            log_p[some] += self.scores.log_prior(z[some])
+            log_p[some] += log_prior
 
         return np.where(np.isfinite(log_p), log_p, -np.inf), Columns(mean, deviation)
 
-    def _possible(self, z: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
-        """Return the hyperparameters and the indices of scores whose density may be positive."""
+    def _possible(self, z: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
+        """Return hyperparameters, log priors and indices where the density may be positive."""
         theta = self.theta(z)
         log_prior = self.scores.log_prior(z)
         size = np.exp(z[:, self.scores.noises])
@@ -189,7 +189,7 @@ class Density:
         possible &= (theta["inverse_gain"].reshape(len(z), -1) != 0.0).all(1)
 
         some = np.flatnonzero(possible)
-        return at(theta, some), some
+        return at(theta, some), log_prior[some], some
 
     def log_evidence(self, theta: Theta) -> Any:
         """Compute log p(rates | theta) at each point, with EP if rates are not Gaussian."""
