@@ -10,11 +10,11 @@ from trustbo.inference import ep, gradient
 from trustbo.inference.engine import Blocks, Fit, Prior, columns_of, evidence
 from trustbo.inference.factor import Order
 from trustbo.inference.importance import Student, climb
-from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
 from trustbo.statespace.blocks import LinearPredictor
+from trustbo.statespace.matrices import namespace
 
 _CHUNK = 32
 """Largest number of points evaluated at once."""

@@ -30,9 +30,9 @@ from trustbo.inference.factor import (
     log_diagonal,
     times,
 )
-from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Chains
 from trustbo.statespace.blocks import LinearPredictor, each
+from trustbo.statespace.matrices import namespace
 
 
 class Blocks(NamedTuple):

@@ -25,7 +25,8 @@ from scipy import sparse
 from scipy.linalg import lapack
 
 from trustbo.kernels import kernel
-from trustbo.models.backend import inverse_and_log_det, inverse_from_factor, namespace
+from trustbo.models.backend import inverse_and_log_det, inverse_from_factor
+from trustbo.statespace.matrices import namespace
 
 _CHAIN_BLOCK = 30
 """Number of columns of a chain that are eliminated at once."""

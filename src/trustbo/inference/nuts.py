@@ -25,7 +25,8 @@ from scipy import optimize
 from trustbo.inference import importance
 from trustbo.inference.density import Density, Draws
 from trustbo.inference.diagnostics import complaints_of
-from trustbo.models.backend import namespace, own_settings
+from trustbo.models.backend import own_settings
+from trustbo.statespace.matrices import namespace
 from trustbo.streams import stream
 
 _POINTS = 2000

@@ -21,8 +21,6 @@ import numpy as np
 from scipy import special
 from scipy.linalg import lapack
 
-from trustbo.statespace.matrices import namespace as namespace
-
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "IProgress not found")
     import numpyro

@@ -8,13 +8,13 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 
-from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import CoupledWeights
 from trustbo.models.model import TrustModel
 from trustbo.models.params import COUPLED_NAMES, CoupledParams
 from trustbo.statespace import StateSpace
 from trustbo.statespace.form import coupled_robots
+from trustbo.statespace.matrices import namespace
 
 
 @dataclass(frozen=True, repr=False)

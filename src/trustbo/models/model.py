@@ -15,7 +15,6 @@ from scipy import sparse
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_choice, require_list
-from trustbo.models.backend import namespace
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Effect, Theta, sample_columns
 from trustbo.models.effects.weights import Weights
@@ -25,6 +24,7 @@ from trustbo.models.priors import Priors
 from trustbo.models.scores import NormalScores
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.statespace.blocks import Layout, LinearPredictor
+from trustbo.statespace.matrices import namespace
 from trustbo.workspace import Workspace
 
 MODELS: dict[str, type["TrustModel"]] = {}

@@ -10,13 +10,14 @@ import numpyro.distributions as dist
 from trustbo.data import levels_of
 from trustbo.display import Rows
 from trustbo.errors import TrustboError, require_positive
-from trustbo.models.backend import namespace, own_settings
+from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Theta
 from trustbo.models.families import FAMILIES, Family, Levels
 from trustbo.models.observations import Observations
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 from trustbo.statespace import Inputs
+from trustbo.statespace.matrices import namespace
 
 SUCCESS = "success"
 FAILURE = "failure"

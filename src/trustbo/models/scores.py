@@ -24,7 +24,8 @@ from scipy import special, stats
 from scipy.interpolate import CubicSpline
 
 from trustbo.errors import TrustboError
-from trustbo.models.backend import call, namespace, own_settings, special_functions
+from trustbo.models.backend import call, own_settings, special_functions
+from trustbo.statespace.matrices import namespace
 
 NOISES = "delta_w", "delta_v"
 _LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)

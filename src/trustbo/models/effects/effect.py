@@ -17,9 +17,9 @@ from numpyro.distributions import Distribution
 
 from trustbo.data import Mission
 from trustbo.errors import require_positive
-from trustbo.models.backend import namespace
 from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
+from trustbo.statespace.matrices import namespace
 from trustbo.workspace import Workspace
 
 Theta = Mapping[str, Any]

@@ -11,11 +11,12 @@ from scipy import sparse
 
 from trustbo.data import Mission
 from trustbo.errors import require_positive
-from trustbo.models.backend import inverse, namespace
+from trustbo.models.backend import inverse
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
 from trustbo.models.visited import bounds_of, visited
+from trustbo.statespace.matrices import namespace
 from trustbo.workspace import Workspace
 
 _JITTER = 1e-8  # added to the correlation matrix of cells

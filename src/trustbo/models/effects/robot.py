@@ -16,9 +16,9 @@ from numpy.random import Generator
 from scipy import sparse
 
 from trustbo.errors import require_share
-from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import LEAST, Chains, Effect, Theta, Values
 from trustbo.models.observations import Observations
+from trustbo.statespace.matrices import namespace
 
 
 @dataclass(frozen=True)

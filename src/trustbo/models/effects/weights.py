@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from trustbo.models.backend import namespace
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.models.priors import Priors
+from trustbo.statespace.matrices import namespace
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ import numpyro.distributions as dist
 from numpy.random import Generator
 from scipy import special
 
-from trustbo.models.backend import namespace, own_settings, special_functions
+from trustbo.models.backend import own_settings, special_functions
 from trustbo.models.families.family import Array, Drawn, Family, Moments
 from trustbo.models.families.moments import draw_between_knots, log_normal, match_by_nodes
+from trustbo.statespace.matrices import namespace
 
 _KNOTS = np.linspace(-5.0, 5.0, 21)  # knots of the proposal, in sds from the mean
 _LEAST = 1e-12  # smallest parameter of a beta distribution that is drawn from

@@ -7,10 +7,11 @@ import numpy as np
 from numpy.random import Generator
 from scipy.stats import norm
 
-from trustbo.models.backend import namespace, special_functions
+from trustbo.models.backend import special_functions
 from trustbo.models.families.family import Array, Drawn, Moments
 from trustbo.models.families.gaussian import Gaussian
 from trustbo.models.families.moments import draw_between, match_interval
+from trustbo.statespace.matrices import namespace
 
 
 @dataclass(frozen=True)

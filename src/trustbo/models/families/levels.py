@@ -7,9 +7,10 @@ import numpy as np
 from numpy.random import Generator
 from scipy import special
 
-from trustbo.models.backend import namespace, special_functions
+from trustbo.models.backend import special_functions
 from trustbo.models.families.family import Array, Drawn, Family, Moments
 from trustbo.models.families.moments import draw_between, match_interval
+from trustbo.statespace.matrices import namespace
 
 _LEAST_P = 1e-300  # smallest probability of a report, so that its log is finite
 _SHARES = np.array([0.252201, 0.585225, 0.162574])

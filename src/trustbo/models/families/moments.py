@@ -7,8 +7,8 @@ from numpy import ndarray
 from numpy.random import Generator
 from scipy import special
 
-from trustbo.models.backend import namespace
 from trustbo.models.families.family import Array, Drawn, Moments
+from trustbo.statespace.matrices import namespace
 
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
 _LOG_WEIGHTS = np.log(_WEIGHTS / _WEIGHTS.sum())
