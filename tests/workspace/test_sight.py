@@ -90,5 +90,5 @@ def test_one_position_is_in_the_pixel_that_many_are_in():
     surface = surface_of(np.zeros((40, 30)))._replace(pixel=(0.5, 2.0), origin=(3.0, 7.0))
     x, y = np.random.default_rng(0).uniform(-30.0, 80.0, (2, 500)).round(1)  # halves too
     rows, cols = surface.nearest(x, y)
-    one_by_one = [surface.pixel_at(*p) for p in zip(x.tolist(), y.tolist(), strict=True)]
+    one_by_one = [surface.nearest(*p) for p in zip(x.tolist(), y.tolist(), strict=True)]
     assert one_by_one == list(zip(rows.tolist(), cols.tolist(), strict=True))

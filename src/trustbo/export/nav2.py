@@ -248,8 +248,7 @@ def occupancy(
     for i in range(n_y):  # row by row, because maps may be large
         x = (np.arange(n_x) + 0.5) * side
         places = frame.to_crs(np.column_stack([x, np.full(n_x, (i + 0.5) * side)]) + corner)
-        col = np.floor((places[:, 0] - left) / grid.cell_width).astype(int)
-        row = rows - 1 - np.floor((places[:, 1] - bottom) / grid.cell_height).astype(int)
+        row, col = np.floor(grid.to_cell(*places.T)).astype(int)
         inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
         values[i, inside] = percent[row[inside], col[inside]]
     return values, corner.tolist(), side

@@ -8,6 +8,7 @@ from numba import njit
 
 from trustbo.kernels import PART, kernel
 from trustbo.team import Robot
+from trustbo.terrain.pixels import nearest_pixel
 from trustbo.workspace.routes import speed_share
 from trustbo.workspace.surface import Surface
 
@@ -119,7 +120,7 @@ def _within_a_turn(angle):
 def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip):
     """Integrate the motion in steps; return the poses after each tick, and the status code."""
     speed, turn_rate, max_slope = limits
-    rows, cols = gradient.shape[1:]
+    shape = gradient.shape[1:]
 
     x = route[0, 0]
     y = route[0, 1]
@@ -141,8 +142,7 @@ def _drive(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip)
             turn = min(turn_rate * dt, max(-turn_rate * dt, error))
             heading += turn
 
-            i = min(rows - 1, max(0, int((origin[1] - y) / pixel[0] + 0.5)))
-            j = min(cols - 1, max(0, int((x - origin[0]) / pixel[1] + 0.5)))
+            i, j = nearest_pixel(x, y, origin, pixel, shape)
             gx = gradient[0, i, j]
             gy = gradient[1, i, j]
 

@@ -11,7 +11,8 @@ from trustbo.terrain.features import (
     gradient,
 )
 from trustbo.terrain.lidar import read_lidar
-from trustbo.terrain.read import pixel_size, read_terrain
+from trustbo.terrain.pixels import pixel_size
+from trustbo.terrain.read import read_terrain
 
 __all__ = [
     "FEATURES", "PAPER_VISIBILITY", "TRAVERSABILITY", "VISIBILITY", "CompositeIndex", "example",

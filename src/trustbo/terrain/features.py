@@ -15,7 +15,7 @@ from scipy import ndimage
 from trustbo.errors import TrustboError, one_line, require_kind, require_tuple, require_whole
 from trustbo.parallel import over_rows
 from trustbo.terrain import rays
-from trustbo.terrain.read import pixel_size
+from trustbo.terrain.pixels import pixel_size
 
 TRAVERSABILITY = ("slope", "roughness", "tri", "step_height")
 """Pixel features of traversability (z1); each lowers it."""

@@ -22,6 +22,7 @@ from rioxarray.exceptions import MissingSpatialDimensionError
 from trustbo.errors import TrustboError, require_kind, require_positive, warn
 from trustbo.files import FilePath
 from trustbo.terrain.heights import ACCESSOR_FILL, in_metres
+from trustbo.terrain.pixels import pixel_size
 from trustbo.terrain.place import (
     horizontal,
     on_metric_grid,
@@ -146,13 +147,6 @@ def _with_grid_mapping(terrain: xr.Dataset) -> xr.Dataset:
     """Make the variable with the CRS a coordinate, which it is not in a file opened by xarray."""
     names = {terrain[name].attrs.get("grid_mapping", "spatial_ref") for name in ("dem", "dsm")}
     return terrain.set_coords([name for name in names if name in terrain.variables])
-
-
-def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
-    """Return pixel height and width in metres."""
-    require_kind("terrain", terrain, xr.Dataset, "give a Dataset as from read_terrain")
-    y, x = (terrain.variables[axis].values for axis in ("y", "x"))
-    return abs(float(y[-1] - y[0])) / (len(y) - 1), abs(float(x[-1] - x[0])) / (len(x) - 1)
 
 
 def check_size(shape: tuple[int, ...], name: str) -> None:

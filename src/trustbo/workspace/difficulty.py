@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from trustbo.kernels import kernel
 from trustbo.parallel import in_order
+from trustbo.terrain.pixels import nearest_pixel
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 from trustbo.workspace.posts import TRAVERSABLE, Posts
@@ -133,13 +134,10 @@ def _tilt(way, gradient, pixel, origin):
     tilt = np.empty(n)
     sums = np.zeros(n + 1)
 
-    rows = gradient.shape[1]
-    cols = gradient.shape[2]
     for k in range(n):
         x, y = _point(way, along, k * _STEP)
         ahead_x, ahead_y = _point(way, along, k * _STEP + _AHEAD)
-        i = min(rows - 1, max(0, int((origin[1] - y) / pixel[0] + 0.5)))
-        j = min(cols - 1, max(0, int((x - origin[0]) / pixel[1] + 0.5)))
+        i, j = nearest_pixel(x, y, origin, pixel, gradient.shape[1:])
 
         gx = gradient[0, i, j]
         gy = gradient[1, i, j]

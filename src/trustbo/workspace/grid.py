@@ -5,6 +5,7 @@ import operator
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -15,6 +16,7 @@ from rasterio.transform import from_origin
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_pair
+from trustbo.terrain.pixels import index_within, row_and_col
 from trustbo.terrain.place import converted, quiet_affine
 
 type Location = Cell | Mapping[str, float]
@@ -167,7 +169,11 @@ class Grid(Summary):
 
         if names == ("lon", "lat"):
             x, y = converted(WGS84, self.require_crs(), x, y)
-        return (self.top - y) / self.cell_height, (x - self.left) / self.cell_width
+        return self.to_cell(x, y)
+
+    def to_cell(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Convert positions in CRS metres to fractional rows and columns of cells."""
+        return row_and_col(x, y, (self.left, self.top), (self.cell_height, self.cell_width))
 
     def _extent_text(self) -> str:
         """Describe the extent of the grid for error messages; empty without a CRS."""
@@ -237,10 +243,8 @@ class Grid(Summary):
 
     def cells_along(self, y: ArrayLike, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the row of the cell at each `y` and the column of the cell at each `x`."""
-        rows, cols = self.shape
-        row = ((self.top - np.asarray(y)) / self.cell_height).astype(int)
-        col = ((np.asarray(x) - self.left) / self.cell_width).astype(int)
-        return np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)
+        row, col = self.to_cell(np.asarray(x), np.asarray(y))
+        return index_within(row, self.shape[0]), index_within(col, self.shape[1])
 
     def require_crs(self) -> CRS:
         """Return the CRS; raises TrustboError if the grid has none."""

@@ -123,14 +123,14 @@ class Posts:
                 c = row, col
 
                 region, (top, left) = self._linked_to(self.stop(a), a, c)
-                end = self.surface.pixel_at(*self.stop(c).tolist())
+                end = self.surface.nearest(*self.stop(c))
                 linked[m, *c] = linked[last - m, *a] = region[end[0] - top, end[1] - left]
         return linked
 
     def are_parted_by_missing(self, a: Cell, c: Cell) -> bool:
         """Return whether only pixels without a height part the stops of two cells."""
         rows, cols = self.surface.ground.shape
-        ends = [self.surface.pixel_at(*self.stop(cell).tolist()) for cell in (a, c)]
+        ends = [self.surface.nearest(*self.stop(cell)) for cell in (a, c)]
 
         known = self.surface.passable
         # The slope is unknown, too, beside a missing height.
@@ -300,7 +300,7 @@ class Posts:
 
     def _is_in_region(self, position: np.ndarray) -> bool:
         """Return whether a position is in the largest passable region."""
-        return bool(self._standable[self.surface.pixel_at(*position.tolist())])
+        return bool(self._standable[self.surface.nearest(*position)])
 
     def _linked_to(
         self, position: np.ndarray, *cells: Cell, over: np.ndarray | None = None
@@ -312,7 +312,7 @@ class Posts:
         """
         ground = self.surface.passable if over is None else over
         window = self.window(*cells)
-        pixel = self.surface.pixel_at(*position.tolist())
+        pixel = self.surface.nearest(*position)
         return linked_to(ground, window, pixel), (window[0], window[2])
 
     def _lattice(self, cell: Cell, here: np.ndarray, radius: float) -> np.ndarray:

@@ -15,6 +15,7 @@ from scipy import ndimage
 from trustbo.kernels import kernel
 from trustbo.parallel import plain
 from trustbo.team import Robot
+from trustbo.terrain.pixels import nearest_pixel
 from trustbo.workspace.surface import Surface
 
 Window = tuple[int, int, int, int]
@@ -47,7 +48,7 @@ class Routes:
 
         The route stays inside the pixel window. It has shape (point, 2), x and y in CRS metres.
         """
-        ends = [self._surface.pixel_at(*p.tolist()) for p in (start, goal)]
+        ends = [self._surface.nearest(*position) for position in (start, goal)]
 
         low, high = sorted(ends)  # the reversed route is the same
         key = low, high, window, robot.max_slope
@@ -173,7 +174,7 @@ def at_times(
 @_compiled
 def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
     """Compute the result of `at_times`; the speed decreases with the larger of pitch and roll."""
-    rows, cols = gradient.shape[1:]
+    shape = gradient.shape[1:]
     n = len(first) - 1
     points = np.empty((n, n_samples, 2))
     duration = np.empty(n)
@@ -192,9 +193,7 @@ def _resampled(gradient, pixel, origin, flat, first, limits, n_samples):
             dy = way[k, 1] - way[k - 1, 1]
 
             length = max(np.hypot(dx, dy), 1e-9)
-            i = min(rows - 1, max(0, int((origin[1] - way[k, 1]) / pixel[0] + 0.5)))
-            j = min(cols - 1, max(0, int((way[k, 0] - origin[0]) / pixel[1] + 0.5)))
-
+            i, j = nearest_pixel(way[k, 0], way[k, 1], origin, pixel, shape)
             gx = gradient[0, i, j]
             gy = gradient[1, i, j]
 

@@ -12,6 +12,7 @@ from trustbo.kernels import PART, kernel
 from trustbo.parallel import plain
 from trustbo.team import Robot
 from trustbo.terrain import rays
+from trustbo.terrain.pixels import index_within, row_and_col
 from trustbo.workspace.surface import Surface
 
 _compiled = kernel()
@@ -115,10 +116,12 @@ def _ends(ground, gradient, pixel, origin, sensor, target, optics):
     ends = np.empty((len(sensor), 6))
 
     for i in range(len(sensor)):
-        r0 = _inward((origin[1] - sensor[i, 1]) / pixel[0], n_rows)
-        c0 = _inward((sensor[i, 0] - origin[0]) / pixel[1], n_cols)
-        r1 = _inward((origin[1] - target[i, 1]) / pixel[0], n_rows)
-        c1 = _inward((target[i, 0] - origin[0]) / pixel[1], n_cols)
+        r0, c0 = row_and_col(sensor[i, 0], sensor[i, 1], origin, pixel)
+        r1, c1 = row_and_col(target[i, 0], target[i, 1], origin, pixel)
+        r0 = _inward(r0, n_rows)
+        c0 = _inward(c0, n_cols)
+        r1 = _inward(r1, n_rows)
+        c1 = _inward(c1, n_cols)
 
         z0 = rays.bilinear(ground, r0, c0) + optics[i, 0]
         z1 = rays.bilinear(ground, r1, c1) + optics[i, 1]
@@ -128,8 +131,8 @@ def _ends(ground, gradient, pixel, origin, sensor, target, optics):
         up = z1 - z0
         distance = math.sqrt(east**2 + north**2 + up**2)
 
-        row = min(max(int(r0 + 0.5), 0), n_rows - 1)
-        col = min(max(int(c0 + 0.5), 0), n_cols - 1)
+        row = index_within(r0 + 0.5, n_rows)
+        col = index_within(c0 + 0.5, n_cols)
         gx = gradient[0, row, col]
         gy = gradient[1, row, col]
 

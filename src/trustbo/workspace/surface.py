@@ -7,7 +7,7 @@ import xarray as xr
 from scipy import ndimage
 
 from trustbo.terrain.features import gradient
-from trustbo.terrain.read import pixel_size
+from trustbo.terrain.pixels import index_within, pixel_size, row_and_col
 
 
 class Surface(NamedTuple):
@@ -35,25 +35,19 @@ class Surface(NamedTuple):
         wide = 0.5 * self.pixel[1]
         return float(x[0] - wide), float(y[-1] - high), float(x[-1] + wide), float(y[0] + high)
 
-    def to_pixel(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def to_pixel(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Convert positions in CRS metres to fractional rows and columns."""
-        return (self.origin[1] - y) / self.pixel[0], (x - self.origin[0]) / self.pixel[1]
+        return row_and_col(x, y, self.origin, self.pixel)
 
-    def nearest(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows and columns of the pixels nearest to positions."""
-        row, col = self.to_pixel(np.asarray(x), np.asarray(y))
-        rows, cols = self.ground.shape
-        return (
-            np.minimum(np.maximum(np.rint(row), 0), rows - 1).astype(int),
-            np.minimum(np.maximum(np.rint(col), 0), cols - 1).astype(int),
-        )
+    def nearest(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """Return the rows and columns of the pixels nearest to positions.
 
-    def pixel_at(self, x: float, y: float) -> tuple[int, int]:
-        """Return the row and column of the pixel nearest to one position."""
+        Of two pixels that are equally near, it is the one with the even index, so that rounding has
+        no direction. In kernels, it is the southern or eastern one; see `nearest_pixel`.
+        """
+        row, col = self.to_pixel(x, y)
         rows, cols = self.ground.shape
-        row = (self.origin[1] - y) / self.pixel[0]
-        col = (x - self.origin[0]) / self.pixel[1]
-        return min(max(round(row), 0), rows - 1), min(max(round(col), 0), cols - 1)
+        return index_within(np.rint(row), rows), index_within(np.rint(col), cols)
 
 
 def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
