@@ -16,6 +16,7 @@ from trustbo.errors import TrustboError
 _NORTH = 22.5  # degrees; half the angle between two neighbouring moves
 _DISTORTION = 0.01  # relative error of lengths from which a map is warped
 _SMALLEST = 0.01  # m; smaller pixels of a map are in degrees
+_DEGREE = 111_320.0  # m: length of a degree of latitude
 _STEP = 100.0  # m; distance over which a map's directions and lengths are measured
 
 
@@ -145,10 +146,22 @@ def converted(source: Any, target: Any, x: Any, y: Any) -> tuple[Any, Any]:
     return Transformer.from_crs(source, target, always_xy=True).transform(x, y)
 
 
+def pixel_side(heights: xr.DataArray) -> float:
+    """Return the shorter side of a raster's pixels in metres, for degrees about."""
+    side = _shorter_side(heights)
+    return side * _DEGREE if heights.rio.crs.is_geographic else side
+
+
+def _shorter_side(heights: xr.DataArray) -> float:
+    """Return the shorter side of a raster's pixels in the unit of its CRS."""
+    with quiet_affine():
+        return min(abs(side) for side in heights.rio.resolution())
+
+
 def same_grid(a: xr.DataArray, b: xr.DataArray) -> bool:
     """Return whether the pixels of two rasters coincide within a thousandth of a pixel."""
     if a.shape != b.shape or a.rio.crs != b.rio.crs:
         return False
     with quiet_affine():
-        pixel = min(abs(side) for side in a.rio.resolution())
-        return np.allclose(a.rio.bounds(), b.rio.bounds(), rtol=0.0, atol=1e-3 * pixel)
+        rounding = 1e-3 * _shorter_side(a)
+        return np.allclose(a.rio.bounds(), b.rio.bounds(), rtol=0.0, atol=rounding)

@@ -6,6 +6,8 @@ NaN where missing, on a metric grid with north at the top.
 
 import math
 import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from os import PathLike
 from os.path import expanduser, isdir
 from typing import Any
@@ -26,6 +28,7 @@ from trustbo.terrain.pixels import pixel_size
 from trustbo.terrain.place import (
     horizontal,
     on_metric_grid,
+    pixel_side,
     placed,
     quiet_affine,
     require_map,
@@ -37,7 +40,6 @@ _MOST_PIXELS = 1e8  # per raster: about 3 GB while it is read
 _CLIPPED = 0.02  # fraction of pixels with the surface below the ground that causes a warning
 _UNCOVERED = 0.02  # fraction of the DEM without a surface that causes a warning
 _COARSER = 2.0  # ratio of pixel sizes from which the coarser raster smooths the heights
-_DEGREE = 111_320.0  # m: length of a degree of latitude
 _TILES = "to read tiles as one raster, combine them: gdalbuildvrt -srcnodata -9999 all.vrt *.tif"
 _ROUNDING = 1e-3  # of a pixel: smaller errors of a grid are rounding
 _EXACT = 1e-6  # of a pixel: smaller errors of coordinates are left as they are
@@ -89,17 +91,27 @@ def read_terrain(
     if dsm is not None:
         stored.append(_stored(dsm, "dsm"))
 
+    terrain = _on_one_grid(stored, crs, nodata)
+    if dsm is None:
+        warn("no surface (DSM) is given, so no canopy is known: only the ground blocks sight.")
+    return terrain if resolution is None else _averaged(terrain, resolution)
+
+
+def _on_one_grid(
+    stored: Sequence[xr.DataArray], crs: object, nodata: float | None = None
+) -> xr.Dataset:
+    """Convert the stored values of a DEM and, if given, a DSM to a terrain on the DEM's grid.
+
+    See `read_terrain` for the arguments and the result.
+    """
     # If one raster has a CRS and the other has none, `crs` is that of the other.
     is_placed = [raster.rio.crs is not None for raster in stored]
     given = [crs if all(is_placed) or not own else None for own in is_placed]
 
-    heights = [_heights(*one, nodata) for one in zip(stored, given, strict=True)]
-    if dsm is None:
-        warn("no surface (DSM) is given, so no canopy is known: only the ground blocks sight.")
-
+    heights = [_heights(raster, own, nodata) for raster, own in zip(stored, given, strict=True)]
     ground = heights[0]
     surface = heights[-1]
-    sides = _pixel_side(ground), _pixel_side(surface)
+    sides = pixel_side(ground), pixel_side(surface)
 
     datums = [heights.attrs["datum"] for heights in (ground, surface)]
     if all(datums) and datums[0] != datums[1]:
@@ -117,9 +129,7 @@ def read_terrain(
             )
 
     surface = on_metric_grid(surface)
-    terrain = _averaged(_paired(ground, surface, sides), resolution).rio.write_crs(ground.rio.crs)
-    with quiet_affine():
-        return terrain.rio.write_transform(terrain.rio.transform(recalc=True))
+    return _placed_on(_paired(ground, surface, sides), ground.rio.crs)
 
 
 def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
@@ -131,7 +141,9 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
     if not {"dem", "dsm"} <= {*require_kind("terrain", terrain, xr.Dataset, remedy)}:
         raise TrustboError(f"the terrain has {', '.join(map(str, terrain))}; {remedy}.")
 
-    terrain = _with_grid_mapping(terrain)
+    # The variable with the CRS is not a coordinate in a file that was opened by xarray.
+    names = {terrain[name].attrs.get("grid_mapping", "spatial_ref") for name in ("dem", "dsm")}
+    terrain = terrain.set_coords([name for name in names if name in terrain.variables])
     crs = terrain.rio.crs or terrain["dem"].rio.crs
     if crs is None:
         raise TrustboError(
@@ -139,14 +151,8 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
             'decode_coords="all", or set it, e.g. with terrain.rio.write_crs("EPSG:32633").'
         )
 
-    read = read_terrain(terrain["dem"], terrain["dsm"], crs=crs)
-    return read.assign_attrs(terrain.attrs)
-
-
-def _with_grid_mapping(terrain: xr.Dataset) -> xr.Dataset:
-    """Make the variable with the CRS a coordinate, which it is not in a file opened by xarray."""
-    names = {terrain[name].attrs.get("grid_mapping", "spatial_ref") for name in ("dem", "dsm")}
-    return terrain.set_coords([name for name in names if name in terrain.variables])
+    stored = [_stored_array(terrain[name], name) for name in ("dem", "dsm")]
+    return _on_one_grid(stored, crs).assign_attrs(terrain.attrs)
 
 
 def check_size(shape: tuple[int, ...], name: str) -> None:
@@ -182,28 +188,39 @@ def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
     require_kind(role, raster, str | PathLike | xr.DataArray, remedy)
 
     if isinstance(raster, xr.DataArray):
-        name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
-    else:
-        raster = expanduser(raster)
-        name = f"{role}: {raster!r}"
-        if isdir(raster):
-            raise TrustboError(f"{name} is a folder; give the path of a raster. {_TILES}.")
+        return _stored_array(raster, role)
 
+    path = expanduser(raster)
+    name = f"{role}: {path!r}"
+    if isdir(path):
+        raise TrustboError(f"{name} is a folder; give the path of a raster. {_TILES}.")
+
+    quiet = warnings.catch_warnings(action="ignore", category=NotGeoreferencedWarning)
+    with _reading(name), quiet, rasterio.open(path) as file:
+        return _of_array(_of_file(file, name), name)
+
+
+def _stored_array(raster: xr.DataArray, role: str) -> xr.DataArray:
+    """Read stored values of an array, dims (y, x), named after `role` in messages."""
+    name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
+    with _reading(name):
+        return _of_array(raster, name).compute()  # reads the file of a lazy array
+
+
+@contextmanager
+def _reading(name: str) -> Iterator[None]:
+    """Raise a TrustboError for an error of GDAL, with the message of its first cause.
+
+    The first cause names the file or the block that cannot be read.
+    """
     try:
-        if isinstance(raster, xr.DataArray):
-            return _of_array(raster, name).compute()  # reads the file of a lazy array
-        quiet = warnings.catch_warnings(action="ignore", category=NotGeoreferencedWarning)
-        with quiet, rasterio.open(raster) as file:
-            return _of_array(_of_file(file, name), name)
+        yield
     except RasterioError as error:
-        raise TrustboError(f"{name} cannot be read by GDAL: {_cause_of(error)}.") from None
-
-
-def _cause_of(error: BaseException) -> str:
-    """Return the message of GDAL's first error, which names the file or the block."""
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return str(error).rstrip(".")
+        cause: BaseException = error
+        while cause.__cause__ is not None:
+            cause = cause.__cause__
+        message = str(cause).rstrip(".")
+        raise TrustboError(f"{name} cannot be read by GDAL: {message}.") from None
 
 
 def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
@@ -326,13 +343,6 @@ def _even(values: np.ndarray, what: str) -> np.ndarray:
     return given if off <= _EXACT * step else even
 
 
-def _pixel_side(heights: xr.DataArray) -> float:
-    """Return the shorter side of a raster's pixels in metres, for degrees about."""
-    with quiet_affine():
-        side = min(abs(step) for step in heights.rio.resolution())
-    return side * _DEGREE if heights.rio.crs.is_geographic else side
-
-
 def _paired(ground: xr.DataArray, surface: xr.DataArray, sides: tuple[float, float]) -> xr.Dataset:
     """Combine two rasters on one grid, with common NaN and no surface below the ground.
 
@@ -381,11 +391,8 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray, sides: tuple[float, flo
     return xr.Dataset(maps, {axis: ground[axis].values for axis in ("y", "x")})
 
 
-def _averaged(terrain: xr.Dataset, resolution: float | None) -> xr.Dataset:
+def _averaged(terrain: xr.Dataset, resolution: float) -> xr.Dataset:
     """Average square blocks of side `resolution`, m; NaN if over half of a block is missing."""
-    if resolution is None:
-        return terrain
-
     side = require_positive("resolution", resolution)
     shape = terrain["dem"].shape
     tall, wide = (max(1, round(side / pixel)) for pixel in pixel_size(terrain))
@@ -394,4 +401,12 @@ def _averaged(terrain: xr.Dataset, resolution: float | None) -> xr.Dataset:
         raise TrustboError(f"{shape} pixels are too few for {tall} x {wide}; reduce resolution=.")
 
     squares: Any = terrain.coarsen(y=tall, x=wide, boundary="trim")
-    return squares.mean().where(2 * squares.count() >= tall * wide)
+    mean = squares.mean().where(2 * squares.count() >= tall * wide)
+    return _placed_on(mean, terrain.rio.crs)
+
+
+def _placed_on(terrain: xr.Dataset, crs: Any) -> xr.Dataset:
+    """Store the CRS, and the position and the size of the pixels in it."""
+    terrain = terrain.rio.write_crs(crs)
+    with quiet_affine():
+        return terrain.rio.write_transform(terrain.rio.transform(recalc=True))
