@@ -55,7 +55,7 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
             f"{workspace.terrain.rio.crs}; reproject the terrain."
         )
 
-    surface = surface_of(terrain, np.isfinite(terrain["dem"].values))
+    surface = surface_of(terrain)
     extent = surface.extent
     needed = planned.extent
 

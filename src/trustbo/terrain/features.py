@@ -72,7 +72,12 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
     """Compute the gradient of the ground to the east and north (Horn 1981), (2, row, col)."""
     if getattr(dem, "ndim", 0) != 2 or not dem.size or dem.dtype.kind not in "iuf":
         raise TrustboError(f"dem must be an array of heights (row, col); got {one_line(dem)}.")
-    height, width = require_tuple("pixel", pixel, 2)
+    return horn_gradient(dem, require_tuple("pixel", pixel, 2))
+
+
+def horn_gradient(dem: np.ndarray, pixel: tuple[float, ...]) -> np.ndarray:
+    """Compute the gradient of heights and pixels that were checked; see `gradient`."""
+    height, width = pixel
     w = _window(dem)
     east = (w[-1, 1] - w[-1, -1]) + 2.0 * (w[0, 1] - w[0, -1]) + (w[1, 1] - w[1, -1])
     south = (w[1, -1] - w[-1, -1]) + 2.0 * (w[1, 0] - w[-1, 0]) + (w[1, 1] - w[-1, 1])
@@ -83,7 +88,8 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
 def slope(terrain: xr.Dataset) -> np.ndarray:
     """Compute the slope of the ground, rad (Horn 1981)."""
     z = terrain["dem"].values
-    return np.arctan(np.hypot(*gradient(z, pixel_size(terrain)))) + (z - z)  # missing stays missing
+    steepness = np.hypot(*horn_gradient(z, pixel_size(terrain)))
+    return np.arctan(steepness) + (z - z)  # missing stays missing
 
 
 @feature("roughness", sign=-1)

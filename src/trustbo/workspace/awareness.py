@@ -14,30 +14,28 @@ from trustbo.arrays import read_labelled
 from trustbo.data import is_line_of_sight
 from trustbo.errors import TrustboError, require_choice, require_kind
 from trustbo.team import Team
-from trustbo.terrain import FEATURES, CompositeIndex, pixel_size
-from trustbo.terrain.features import slope
+from trustbo.terrain import FEATURES, CompositeIndex
 from trustbo.workspace.grid import MAX_MISSING, Grid
 from trustbo.workspace.line_of_sight import bound_maps
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, existing_bounds
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
+from trustbo.workspace.surface import Surface
 
 _DIMS = ("robot", "move", "row", "col", "feature")
 _AXES = "(robot, row, col, feature) or (robot, move, row, col, feature) with 8 moves"
 
 
-def cell_maps(
-    terrain: xr.Dataset, grid: Grid, features: Mapping[str, object], team: Team, sight: Sight
-) -> tuple[np.ndarray, np.ndarray, xr.Dataset, dict[str, CompositeIndex]]:
-    """Compute the awareness and the passability of a terrain's cells.
+def pixel_maps(
+    terrain: xr.Dataset, features: Mapping[str, object], options: Mapping[str, Mapping[str, float]]
+) -> tuple[xr.Dataset, dict[str, CompositeIndex]]:
+    """Compute the features of a terrain's pixels, and fit the composite indices.
 
-    Openness is computed for the team's sensor and target heights. Its range is the smallest of the
-    team's largest lidar range, the diagonal of a cell, and half the terrain's shorter side. The
-    canopy of openness and vegetation density is that of the assumed model of sight.
+    `features` are those of `Workspace.from_terrain`; `options` are arguments of pixel features, by
+    name, as from `options_of`.
 
     Returns:
-        Awareness (row, col, feature) in [0, 1], NaN where a cell has no data; passability (row,
-        col); a dataset (y, x) of each feature and of passability; and the fitted composite indices.
+        A dataset (y, x) of each feature, in [0, 1], and the fitted composite indices.
 
     Raises:
         TrustboError: A feature is unknown, has a name that is reserved for line of sight, or is
@@ -50,20 +48,6 @@ def cell_maps(
     for name in features:
         if is_line_of_sight(name):
             raise TrustboError(f"feature name {name!r} is reserved; choose another name.")
-
-    sides = [n * step for n, step in zip(terrain["dem"].shape, pixel_size(terrain), strict=True)]
-    diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
-    ranges = [robot.lidar_range for robot in team.robots]
-
-    lidar = {
-        "reach": min(max(ranges), diagonal, 0.5 * min(sides)),
-        "eye": team.robots[0].sensor_height,
-        "target": team.lead.target_height,
-    }
-    options = {
-        "openness": lidar | {"extinction": sight.extinction, "crown_base": sight.crown_base},
-        "vegetation_density": {"crown_base": sight.crown_base},
-    }
 
     def values_of(name: str) -> np.ndarray:
         compute = FEATURES[require_choice("feature", name, FEATURES)].compute
@@ -92,17 +76,49 @@ def cell_maps(
         composites[name] = index
 
     dem = terrain["dem"]
-    is_drivable = slope(terrain) <= team.max_slope
-
     maps = {
         name: xr.DataArray(values, dem.coords, dem.dims, attrs={"units": "1"})
         for name, values in pixels.items()
     }
+    return xr.Dataset(maps), composites
 
-    z = np.stack([grid.cell_means(one) for one in maps.values()], axis=-1)
-    maps["passable"] = xr.DataArray(is_drivable, dem.coords, dem.dims)
-    passable = grid.cell_means(maps["passable"].astype(float)) >= 1.0 - MAX_MISSING
-    return z, passable & np.isfinite(z).all(-1), xr.Dataset(maps), composites
+
+def options_of(
+    surface: Surface, grid: Grid, team: Team, sight: Sight
+) -> dict[str, dict[str, float]]:
+    """Return arguments of pixel features that depend on the team and on the assumed sight.
+
+    Openness is computed for the team's sensor and target heights. Its range is the smallest of the
+    team's largest lidar range, the diagonal of a cell, and half the terrain's shorter side. The
+    canopy of openness and vegetation density is that of the assumed model of sight.
+    """
+    sides = np.multiply(surface.ground.shape, surface.pixel)
+    diagonal = float(np.hypot(grid.cell_height, grid.cell_width))
+    ranges = [robot.lidar_range for robot in team.robots]
+
+    lidar = {
+        "reach": min(max(ranges), diagonal, 0.5 * float(sides.min())),
+        "eye": team.robots[0].sensor_height,
+        "target": team.lead.target_height,
+    }
+    return {
+        "openness": lidar | {"extinction": sight.extinction, "crown_base": sight.crown_base},
+        "vegetation_density": {"crown_base": sight.crown_base},
+    }
+
+
+def cell_maps(
+    pixels: xr.Dataset, drivable: xr.DataArray, grid: Grid
+) -> tuple[np.ndarray, np.ndarray]:
+    """Average the features of pixels, dims (y, x), over cells.
+
+    Returns:
+        Awareness (row, col, feature) in [0, 1], NaN where a cell has no data; and passability (row,
+        col): enough pixels of a passable cell are `drivable`, and all its features are known.
+    """
+    z = np.stack([grid.cell_means(values) for values in pixels.values()], axis=-1)
+    passable = grid.cell_means(drivable.astype(float)) >= 1.0 - MAX_MISSING
+    return z, passable & np.isfinite(z).all(-1)
 
 
 def of_moves(cells: np.ndarray, passable: np.ndarray) -> np.ndarray:
@@ -115,21 +131,21 @@ def of_moves(cells: np.ndarray, passable: np.ndarray) -> np.ndarray:
 
 
 def with_line_of_sight(
-    z: np.ndarray, features: Sequence[str], passable: np.ndarray, posts: Posts, pixels: xr.Dataset
+    z: np.ndarray, pixels: xr.Dataset, passable: np.ndarray, posts: Posts
 ) -> np.ndarray:
     """Append line of sight to the awareness of bounds (robot, move, row, col, feature).
 
-    If traversability is one of the `features`, its values are replaced with means along the robots'
-    tracks. Raises TrustboError if a cell is too small for the team.
+    If traversability is one of the features of `pixels`, its values are replaced with means along
+    the robots' tracks. Raises TrustboError if a cell is too small for the team.
     """
     for row, col in np.argwhere(passable).tolist():
         posts.require_room((row, col))
 
-    is_known = TRAVERSABLE in features
-    of_pixels = pixels[TRAVERSABLE if is_known else "passable"].values
+    is_known = TRAVERSABLE in pixels
+    of_pixels = pixels[TRAVERSABLE].values if is_known else posts.surface.passable
     seen, traversability = bound_maps(posts, passable, of_pixels)
     if is_known:
-        of_cells = z[..., list(features).index(TRAVERSABLE)]
+        of_cells = z[..., list(pixels).index(TRAVERSABLE)]
         of_cells[...] = np.where(np.isfinite(traversability), traversability, of_cells)
     return np.clip(np.concatenate([z, seen[..., None]], axis=-1), 0.0, 1.0)
 

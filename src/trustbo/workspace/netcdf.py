@@ -9,8 +9,9 @@ from trustbo.files import to_json
 from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace.grid import Grid
-from trustbo.workspace.posts import Posts
+from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
+from trustbo.workspace.surface import surface_of
 from trustbo.workspace.workspace import Workspace
 
 
@@ -54,7 +55,11 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
                 array.encoding["grid_mapping"] = array.attrs.pop("grid_mapping")
 
         pixels = tree["pixels"].to_dataset().assign_coords(spatial_ref=terrain["spatial_ref"])
-        posts = Posts(grid, team, Sight(**json.loads(tree.attrs["sight"])), terrain, pixels)
+
+        surface = surface_of(terrain)._replace(passable=pixels["passable"].values.astype(bool))
+        sight = Sight(**json.loads(tree.attrs["sight"]))
+        traversability = pixels[TRAVERSABLE].values if TRAVERSABLE in pixels else None
+        posts = Posts(grid, team, sight, surface, traversability)
 
     nodes = tree["composites"].children if "composites" in tree else {}
     composites = {

@@ -19,7 +19,6 @@ posts and stops allows for such errors (`Posts._seen`); the feature `line_of_sig
 from collections.abc import Sequence
 
 import numpy as np
-import xarray as xr
 from scipy import ndimage
 from scipy.spatial.distance import cdist
 
@@ -30,7 +29,7 @@ from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
 from trustbo.workspace.routes import Routes, Window, at_times, largest_region, linked_to
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
-from trustbo.workspace.surface import surface_of
+from trustbo.workspace.surface import Surface
 
 TRAVERSABLE = "traversability"
 """Name of the feature that is averaged along the robots' tracks in each bound."""
@@ -68,28 +67,31 @@ class Posts:
     """
 
     def __init__(
-        self, grid: Grid, team: Team, sight: Sight, terrain: xr.Dataset, pixels: xr.Dataset
+        self,
+        grid: Grid,
+        team: Team,
+        sight: Sight,
+        surface: Surface,
+        traversability: np.ndarray | None = None,
     ) -> None:
-        """Prepare the rasters; `pixels` (y, x) has passability and, if known, traversability."""
+        """Prepare the rasters; without `traversability` (row, col), passable pixels are alike."""
         self.grid = grid
         self.team = team
         self.sight = sight
+        self.surface = surface
+        self.routes = Routes(surface)
 
-        self.surface = surface_of(terrain, pixels["passable"].values.astype(bool))
-        self.routes = Routes(self.surface)
-
-        easy = pixels[TRAVERSABLE if TRAVERSABLE in pixels else "passable"].values.astype(float)
-        self._easy = np.nan_to_num(easy)
-        for axis, side in enumerate(self.surface.pixel):
+        easy = surface.passable if traversability is None else traversability
+        self._easy = np.nan_to_num(easy.astype(float))
+        for axis, side in enumerate(surface.pixel):
             size = max(1, round(_SMOOTHED / side))
             self._easy = ndimage.uniform_filter1d(self._easy, size, axis, mode="nearest")
 
-        self._standable = largest_region(self.surface.passable)
-        steep = np.arctan(np.hypot(*self.surface.gradient))
-        self._safe = self._standable & (steep <= _SAFE * team.max_slope)
+        self._standable = largest_region(surface.passable)
+        self._safe = self._standable & (surface.slope <= _SAFE * team.max_slope)
 
         # Cell row of each pixel row, and cell column of each pixel column.
-        self._cells = grid.cells_along(*self.surface.axes)
+        self._cells = grid.cells_along(*surface.axes)
 
         self._central: dict[Cell, np.ndarray] = {}
         self._stops: dict[Cell, np.ndarray] = {}
@@ -133,9 +135,7 @@ class Posts:
         ends = [self.surface.nearest(*self.stop(cell)) for cell in (a, c)]
 
         known = self.surface.passable
-        # The slope is unknown, too, beside a missing height.
-        missing = ndimage.binary_dilation(~np.isfinite(self.surface.ground), np.ones((3, 3)))
-        either = known | missing
+        either = known | np.isnan(self.surface.slope)
 
         now, then = (
             bool(linked_to(mask, (0, rows, 0, cols), ends[0])[ends[1]]) for mask in (known, either)

@@ -34,7 +34,7 @@ class Routes:
     def __init__(self, surface: Surface) -> None:
         """Compute the slope of each pixel, and find the pixels near obstacles."""
         self._surface = surface
-        self._slope = np.arctan(np.hypot(*surface.gradient))
+        self._slope = surface.slope
 
         free: Any = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
         self._is_close = free <= max(_CLEARANCE, *surface.pixel)

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.terrain.features import gradient
+from trustbo.terrain.features import horn_gradient
 from trustbo.terrain.pixels import index_within, pixel_size, row_and_col
 
 
@@ -19,6 +19,12 @@ class Surface(NamedTuple):
     passable: np.ndarray  # (row, col), bool
     pixel: tuple[float, float]  # height, width of a pixel, m
     origin: tuple[float, float]  # x, y of the centre of pixel (0, 0)
+
+    @property
+    def slope(self) -> np.ndarray:
+        """Slope of the ground (row, col), rad; NaN where one of the 3 x 3 heights is missing."""
+        beside_missing = ndimage.binary_dilation(~np.isfinite(self.ground), np.ones((3, 3)))
+        return np.where(beside_missing, np.nan, np.arctan(np.hypot(*self.gradient)))
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -50,20 +56,29 @@ class Surface(NamedTuple):
         return index_within(np.rint(row), rows), index_within(np.rint(col), cols)
 
 
-def surface_of(terrain: xr.Dataset, passable: np.ndarray) -> Surface:
-    """Make the surface of a terrain; `passable` is a mask (row, col) of the terrain's pixels."""
+def surface_of(terrain: xr.Dataset, max_slope: float | None = None) -> Surface:
+    """Make the surface of a terrain.
+
+    Pixels are passable if their slope is known and at most `max_slope`, in rad; without a limit,
+    all pixels with a height are.
+    """
     ground, canopy = (terrain[name].values.astype(float) for name in ("dem", "dsm"))
-    return Surface(
+    pixel = pixel_size(terrain)
+    surface = Surface(
         ground=ground,
         canopy=canopy,
-        gradient=gradient(filled(ground), pixel_size(terrain)),
-        passable=passable,
-        pixel=pixel_size(terrain),
+        gradient=horn_gradient(_filled(ground), pixel),
+        passable=np.isfinite(ground),
+        pixel=pixel,
         origin=(float(terrain["x"][0]), float(terrain["y"][0])),
     )
 
+    if max_slope is None:
+        return surface
+    return surface._replace(passable=surface.slope <= max_slope)
 
-def filled(dem: np.ndarray) -> np.ndarray:
+
+def _filled(dem: np.ndarray) -> np.ndarray:
     """Replace missing heights with the nearest height, because robots may reach missing data."""
     nearest: Any = ndimage.distance_transform_edt(
         ~np.isfinite(dem), return_distances=False, return_indices=True

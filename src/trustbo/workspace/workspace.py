@@ -31,14 +31,16 @@ from trustbo.workspace.awareness import (
     labelled,
     of_arrays,
     of_moves,
+    options_of,
+    pixel_maps,
     unlabelled,
     with_line_of_sight,
 )
 from trustbo.workspace.grid import MAX_MISSING, Grid, Location
 from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds
-from trustbo.workspace.posts import Posts
+from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
-from trustbo.workspace.surface import Surface
+from trustbo.workspace.surface import Surface, surface_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -116,15 +118,26 @@ class Workspace(Summary):
             features = {"traversability": TRAVERSABILITY, "visibility": visibility}
 
         with compiling():
-            cells, passable, pixels, composites = cell_maps(terrain, grid, features, team, sight)
+            # Pixels.
+            surface = surface_of(terrain, team.max_slope)
+            options = options_of(surface, grid, team, sight)
+            pixels, composites = pixel_maps(terrain, features, options)
+            drivable = xr.DataArray(surface.passable, terrain["dem"].coords, ("y", "x"))
+
+            # Cells.
+            cells, passable = cell_maps(pixels, drivable, grid)
+            traversability = pixels[TRAVERSABLE].values if TRAVERSABLE in pixels else None
+            posts = Posts(grid, team, sight, surface, traversability)
+
+            # Bounds.
             z = np.repeat(of_moves(cells, passable)[None], team.n_robots, axis=0)
-            posts = Posts(grid, team, sight, terrain, pixels)
             names = [*features]
             if bounds:
-                z = with_line_of_sight(z, names, passable, posts, pixels)
+                z = with_line_of_sight(z, pixels, passable, posts)
                 names.append(LINE_OF_SIGHT)
 
         maps = labelled(z, passable, grid, team, names)
+        pixels = pixels.assign(passable=drivable)
         return cls(*maps, grid, team, terrain, pixels, composites, posts)
 
     @classmethod
