@@ -80,3 +80,18 @@ def test_cell_means_are_means_of_the_pixels_inside():
 def test_a_grid_too_fine_or_empty_is_refused(shape):
     with pytest.raises(TrustboError):
         Grid.over(synthetic_terrain((120.0, 90.0), seed=2), shape)
+
+
+def test_cells_of_many_positions_are_those_of_each_position():
+    grid = Grid((4, 3), 100.0, 80.0, 10.0, 20.0)
+    x, y = np.random.default_rng(0).uniform(20.0, 180.0, (2, 400)).round(-1)  # edges too
+    x[0] = 1e300
+    found = zip(*(values.tolist() for values in grid.cells_at(x, y)), strict=True)
+
+    for position, (row, col, inside) in zip(zip(x, y, strict=True), found, strict=True):
+        located = {"x": position[0], "y": position[1]}
+        if inside:
+            assert grid.locate(located) == (row, col)
+        else:
+            with pytest.raises(TrustboError, match="outside the grid"):
+                grid.locate(located)

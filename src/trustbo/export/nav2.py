@@ -226,7 +226,6 @@ def occupancy(
         )
 
     grid = workspace.grid
-    rows, cols = workspace.grid.shape
     _require_near(frame, grid.bounds)
 
     shorter = min(grid.cell_height, grid.cell_width)
@@ -248,8 +247,7 @@ def occupancy(
     for i in range(n_y):  # row by row, because maps may be large
         x = (np.arange(n_x) + 0.5) * side
         places = frame.to_crs(np.column_stack([x, np.full(n_x, (i + 0.5) * side)]) + corner)
-        row, col = np.floor(grid.to_cell(*places.T)).astype(int)
-        inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
+        row, col, inside = grid.cells_at(*places.T)
         values[i, inside] = percent[row[inside], col[inside]]
     return values, corner.tolist(), side
 

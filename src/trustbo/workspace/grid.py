@@ -175,6 +175,13 @@ class Grid(Summary):
         """Convert positions in CRS metres to fractional rows and columns of cells."""
         return row_and_col(x, y, (self.left, self.top), (self.cell_height, self.cell_width))
 
+    def cells_at(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the rows and columns of positions, each (position,), and which are on the grid."""
+        rows, cols = self.shape
+        row, col = self.to_cell(x, y)
+        inside = (row >= 0.0) & (row < rows) & (col >= 0.0) & (col < cols)
+        return index_within(row, rows), index_within(col, cols), inside
+
     def _extent_text(self) -> str:
         """Describe the extent of the grid for error messages; empty without a CRS."""
         if self.crs is None:

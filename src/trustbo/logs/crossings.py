@@ -1,0 +1,113 @@
+"""Bounds of a log on a map: the ticks in which the lead enters and leaves the cells of its path."""
+
+from collections.abc import Sequence
+from itertools import groupby
+
+import numpy as np
+import pandas as pd
+
+from trustbo.data import Cell
+from trustbo.errors import TrustboError, require_cells, warn
+from trustbo.logs.poses import GAP, UNITS
+from trustbo.workspace.grid import Grid
+
+_SHORT = 10.0
+"""Length of a log whose unit of time is doubted, s."""
+
+
+def crossings_of(
+    places: pd.DataFrame,
+    n: int,
+    tick: float,
+    grid: Grid,
+    planned: Sequence[Cell] | None,
+) -> tuple[Sequence[Cell], np.ndarray]:
+    """Return the path of the lead, by default all cells that it enters, and edges of its bounds."""
+    located = zip(*grid.cells_at(places["x"].to_numpy(), places["y"].to_numpy()), strict=True)
+    cells = [(int(row), int(col)) if is_on_grid else None for row, col, is_on_grid in located]
+    visits: list[tuple[int, Cell | None]] = list(zip(places["tick"], cells, strict=True))
+
+    entered = [(k, cell) for k, cell in visits if cell is not None]
+    if not entered:
+        x, y = places[["x", "y"]].median()
+        raise TrustboError(
+            f"the lead is never on the grid: its poses are around ({x:.8g}, {y:.8g}). Give x and y "
+            f"in {grid.crs_name}, in which the lower left is {grid.corner}."
+        )
+
+    driven = [cell for cell, _ in groupby(cell for _, cell in entered)]
+    path = require_cells("path", driven if planned is None else planned)
+    if planned is not None and len(path) < 2:
+        raise TrustboError(f"path must have at least two cells; got {list(path)}.")
+
+    edges: list[int] = []
+    for k, cell in entered:
+        if len(edges) < len(path) and cell == path[len(edges)]:
+            edges.append(k)
+
+    short = f" The log lasts {n * tick:g} s; give {UNITS}." if n * tick < _SHORT else ""
+    _require_route(path, edges, entered, short)
+
+    end = _end_of_visit(visits, edges[-1], path[len(edges) - 1], GAP / tick, n)
+    if len(edges) < len(path) and end < n:
+        warn(
+            f"the lead leaves cell {path[len(edges) - 1]} {end * tick:g} s after the start of the "
+            f"log and never enters the next cell of the path, {path[len(edges)]}; the mission is "
+            "read as aborted there."
+        )
+    return path, np.array([*edges[1:], end])
+
+
+def _require_route(
+    path: Sequence[Cell], edges: Sequence[int], entered: Sequence[tuple[int, Cell]], hint: str
+) -> None:
+    """Raise TrustboError if the lead misses a cell of the path, or has no complete bound.
+
+    Args:
+        path: Planned or driven cells.
+        edges: First tick in each cell of the path that is reached in order.
+        entered: Tick and cell of each pose of the lead on the grid.
+        hint: End of the message.
+    """
+    n = len(edges)
+    if n == len(path) > 1:
+        return
+
+    first = entered[0][1]
+    last = entered[-1][1]
+    if n == len(path):
+        raise TrustboError(
+            f"the lead stays in cell {path[0]} of the path, so there is no complete bound; use "
+            f"`Campaign.fail` if no bound was run.{hint}"
+        )
+
+    since = edges[-1] if edges else 0
+    later = [cell for k, cell in entered if k > since and cell in {*path[n + 1 :]} - {*path[:n]}]
+    if later:
+        raise TrustboError(
+            f"the lead never enters cell {path[n]}, number {n} of the path (0 is the start), but "
+            f"enters {later[0]}, which is further along. Pass the path that was driven, or leave "
+            f"path= out to take it from the poses.{hint}"
+        )
+
+    if n < 2:
+        raise TrustboError(
+            f"the lead never enters cell {path[n]}, number {n} of the path (0 is the start), so "
+            f"there is no complete bound; the log begins in cell {first} and ends in {last}. Pass "
+            f"the path of this mission, or use `Campaign.fail` if no bound was run.{hint}"
+        )
+
+
+def _end_of_visit(
+    visits: Sequence[tuple[int, Cell | None]], begin: int, cell: Cell, most: float, n: int
+) -> int:
+    """Return the tick in which the lead leaves a cell for more than `most` ticks, or else `n`."""
+    left = None  # tick at which the lead left the cell, until it returns
+    for k, at in visits:
+        if k < begin or at == cell:
+            left = None
+        elif left is None:
+            left = k
+        if left is not None and k - left > most:
+            return left
+    return n

@@ -1,0 +1,130 @@
+"""Tables of poses and of detections between robots, with warnings of what is ignored in them."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from trustbo.errors import TrustboError, warn
+from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
+
+_OUTSIDE = 0.05
+"""Share of a robot's detections that may lie outside the time of the poses without a warning."""
+_OFTEN = 0.03
+"""Share of intervals between detections that may be shorter than those of the detector."""
+_MANY = 4
+"""Number of detections that may have another cause, such as a tree or a repeated message."""
+_LEAST_EXTENT = 0.1
+"""Extent of all poses below which their unit is doubted, m."""
+
+
+def read_tables(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+    """Read poses (t, robot, x, y, heading), and detections (t, robot, lead).
+
+    Returns the poses, the detections between two robots with poses, and all other detections.
+    """
+    where = Columns(poses, "the table of poses")
+    seen = Columns(detections, "the table of detections", may_be_empty=True)
+    t, seen_at = seconds_of(where, seen)
+    tracks = pd.DataFrame({"t": t, "robot": where.texts("robot", blank=False)})
+    tracks["x"] = where.numbers("x", blank=False)
+    tracks["y"] = where.numbers("y", blank=False)
+    tracks["heading"] = where.numbers("heading", required=False)
+    looks = pd.DataFrame({"t": seen_at, "robot": seen.texts("watcher"), "lead": seen.texts("seen")})
+
+    robots = tracks["robot"].unique().tolist()
+    require_one_spelling("names of robots", [*robots, *looks["robot"], *looks["lead"]])
+    if np.ptp(tracks[["x", "y"]], axis=0).max() < _LEAST_EXTENT:
+        raise TrustboError("all poses lie within 0.1 m; x and y are in metres, not degrees or km.")
+
+    known = looks["robot"].isin(robots) & looks["lead"].isin(robots)
+    between = looks.loc[known & (looks["robot"] != looks["lead"])].drop_duplicates()
+    if between.empty and len(looks):
+        raise TrustboError(
+            f"no detection (watcher, seen) is between two of the robots {', '.join(robots)}, which "
+            f"have poses; watchers are {_listed(looks['robot'])}, and seen are "
+            f"{_listed(looks['lead'])}. If no robot was detected, give a table without rows."
+        )
+    return tracks, between, looks.loc[~known]
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Return different names as text, at most ten of them."""
+    different = [name or "blank" for name in dict.fromkeys(names)]
+    return ", ".join([*different[:10], "..."] if len(different) > 10 else different)
+
+
+def warn_of_names(
+    looks: pd.DataFrame, unknown: pd.DataFrame, leads: Sequence[str], team: Sequence[str]
+) -> None:
+    """Warn of detections that are ignored because of their names, and of robots without any.
+
+    Args:
+        looks: Detections between two robots with poses.
+        unknown: All other detections.
+        leads: Robots that are watched.
+        team: Robots that watch.
+    """
+    robots = {*team, *leads, *looks["robot"], *looks["lead"]}
+    if strangers := [name for name in unknown["robot"].unique() if name not in robots]:
+        warn(
+            f"detections by {_listed(strangers)} are ignored, because the table of poses lacks "
+            "these robots; if a robot was renamed, use one name in both tables."
+        )
+
+    # What is only seen may be a tree, unless it is seen where the lead is no longer seen.
+    of_lead = looks.loc[looks["lead"].isin(leads), "t"]
+    apart = unknown.loc[(unknown["t"] > of_lead.max()) | (unknown["t"] < of_lead.min())]
+    n_apart = apart["lead"].value_counts()
+    n_all = unknown["lead"].value_counts()
+    if replacing := [name for name, n in n_apart.items() if n_all[name] == n > _MANY]:
+        warn(
+            f"{_listed(map(str, replacing))} is seen only before or after all detections of the "
+            f"lead {_listed(leads)}, and has no poses; if the lead was renamed, use one name."
+        )
+
+    named = pd.unique(looks[["robot", "lead"]].to_numpy().ravel())
+    if others := [name for name in named if name not in (*team, *leads)]:
+        warn(
+            f"detections by and of {_listed(others)} are ignored, because they are neither the "
+            f"lead nor in the team ({', '.join(team)}); if a robot was renamed, use one name."
+        )
+    if silent := [name for name in dict.fromkeys([*team, *leads]) if name not in named]:
+        warn(f"no detection names {', '.join(silent)}; their contact is 0.")
+
+
+def warn_of_times(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) -> None:
+    """Warn of detections outside the time of poses, and of a tick that is not their interval."""
+    spans = tracks.groupby("robot")["t"].agg(["min", "max"])
+    of_watcher = spans.loc[looks["robot"]].to_numpy()
+    of_lead = spans.loc[looks["lead"]].to_numpy()
+    t = looks["t"].to_numpy()
+    begin = np.maximum(of_watcher[:, 0], of_lead[:, 0])
+    end = np.minimum(of_watcher[:, 1], of_lead[:, 1])
+    outside = np.maximum(begin - t, t - end)
+
+    watchers = looks["robot"].to_numpy()
+    shares = {name: (outside[watchers == name] > tick).mean() for name in looks["robot"].unique()}
+    if late := [name for name, share in shares.items() if share > _OUTSIDE]:
+        warn(
+            f"up to {max(shares.values()):.0%} of the detections by {_listed(late)} lie outside "
+            f"the time of the poses of the two robots, by up to {outside.max():.3g} s, and are "
+            "ignored; check that both tables have the same clock."
+        )
+
+    gaps = looks.sort_values("t").groupby(["robot", "lead"])["t"].diff().dropna().to_numpy()
+    short = gaps[gaps < 0.5 * tick]
+    apart = float(np.quantile(gaps, _OFTEN)) if gaps.size else np.nan
+    if apart > 1.5 * tick:
+        warn(
+            f"detections of one robot by another are at least {apart:g} s apart, but every tick of "
+            f"{tick:g} s without a detection counts as lost contact; pass tick={apart:g}."
+        )
+    elif len(short) > max(_OFTEN * len(gaps), _MANY):
+        apart = float(np.quantile(short, 0.05))
+        warn(
+            f"detections of one robot by another are only {apart:.3g} s apart, but one detection "
+            f"counts as contact in a whole tick of {tick:g} s; pass the interval between two "
+            f"readings of the detector, such as tick={apart:.3g}."
+        )
