@@ -193,7 +193,7 @@ class Posts:
         if cell not in self._central:
             row, col = self._pixels_of(cell)
 
-            position = self._position(row, col)
+            position = self.surface.centers(row, col)
             size = np.hypot(self.grid.cell_height, self.grid.cell_width)
             off_centre = np.linalg.norm(position - self.grid.center(cell), axis=1) / size
             self._central[cell] = position[np.argmax(self._easy[row, col] - off_centre)]
@@ -331,7 +331,7 @@ class Posts:
 
         row, col = np.unique(pixels[inside], axis=0).T
         kept = linked[row - corner[0], col - corner[1]]
-        return self._position(row[kept], col[kept])
+        return self.surface.centers(row[kept], col[kept])
 
     def _pixels_near(self, cell: Cell, here: np.ndarray) -> np.ndarray:
         """Return positions in a cell, connected to the stop `here` and near it if possible."""
@@ -339,7 +339,7 @@ class Posts:
         region, (top, left) = self._linked_to(here, cell)
         linked = region[row - top, col - left]
 
-        position = self._position(row, col)[linked if linked.any() else slice(None)]
+        position = self.surface.centers(row, col)[linked if linked.any() else slice(None)]
         distance = np.linalg.norm(position - here, axis=1)
         n_robots = len(self.team.robots)
 
@@ -377,8 +377,3 @@ class Posts:
                 break
 
         return row + top, col + left
-
-    def _position(self, row: np.ndarray, col: np.ndarray) -> np.ndarray:
-        """Return the positions of pixels, shape (pixel, 2)."""
-        y, x = self.surface.axes
-        return np.stack([x[col], y[row]], axis=-1)

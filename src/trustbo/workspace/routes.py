@@ -84,9 +84,8 @@ class Routes:
             (goal[0] - top, goal[1] - left),
         )
 
-        x = surface.origin[0] + (pixels[:, 1] + left) * surface.pixel[1]
-        y = surface.origin[1] - (pixels[:, 0] + top) * surface.pixel[0]
-        return np.stack([x, y], axis=1)
+        row, col = pixels.T
+        return surface.centers(row + top, col + left)
 
 
 @_compiled

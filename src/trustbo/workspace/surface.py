@@ -41,6 +41,12 @@ class Surface(NamedTuple):
         wide = 0.5 * self.pixel[1]
         return float(x[0] - wide), float(y[-1] - high), float(x[-1] + wide), float(y[0] + high)
 
+    def centers(self, row: np.ndarray, col: np.ndarray) -> np.ndarray:
+        """Return the positions of pixels' centres, shape (pixel, 2), in CRS metres."""
+        x = self.origin[0] + col * self.pixel[1]
+        y = self.origin[1] - row * self.pixel[0]
+        return np.stack([x, y], axis=-1)
+
     def to_pixel(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Convert positions in CRS metres to fractional rows and columns."""
         return row_and_col(x, y, self.origin, self.pixel)
