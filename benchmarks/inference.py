@@ -108,7 +108,7 @@ def one_case(table, name, n_seeds, later=False, label=""):
     """Add the row of a fit; if `later`, it starts from the posterior of one mission fewer."""
     n, model = FITS[name]
     data = missions(n, limit=model is CENSORED)
-    options = {"whole": False, "check": False}
+    options = {"latent": False, "check": False}
     if later:
         options["start"] = tb.fit(data[:-1], model, **options)
 
@@ -130,9 +130,9 @@ def one_case(table, name, n_seeds, later=False, label=""):
 def nuts(given):
     """Print CPU time and error of NUTS for the default model and eight missions."""
     data, model = missions(8), PooledTrust(effects=EFFECTS)
-    exact = tb.fit(data, model, draws=4000, whole=False)["posterior"].to_dataset()
+    exact = tb.fit(data, model, draws=4000, latent=False)["posterior"].to_dataset()
     started = time.process_time()
-    chains = tb.fit(data, model, sampler="nuts", whole=False, check=False, progress=False)
+    chains = tb.fit(data, model, sampler="nuts", latent=False, check=False, progress=False)
     seconds, over = time.process_time() - started, ("chain", "draw")
     off = abs(chains["posterior"].to_dataset().mean(over) - exact.mean(over)) / exact.std(over)
     worst = max(float(values.max()) for values in off.data_vars.values())
@@ -151,7 +151,7 @@ def accuracy(given):
         found, seconds, attrs = [], [], []
         for seed in range(10 * given.seeds):
             started = time.process_time()
-            fitted = tb.fit(data[:n], seed=seed, whole=False, check=False, progress=False)
+            fitted = tb.fit(data[:n], seed=seed, latent=False, check=False, progress=False)
             seconds.append(time.process_time() - started)
             attrs.append((fitted.attrs["kish"], fitted.attrs["k_hat"]))
             draws = fitted["posterior"]
@@ -269,7 +269,7 @@ def compiled_samplers(data):
         yield from found.items()
 
     def ours(seed):
-        fitted = tb.fit(data, model, seed=seed, whole=False)
+        fitted = tb.fit(data, model, seed=seed, latent=False)
         draws = {name: fitted["posterior"][name].to_numpy() for name in NAMES}
         return {**draws, "kish": fitted.attrs["kish"]}, 0
 

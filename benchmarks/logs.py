@@ -91,7 +91,7 @@ def memory(logs, window):
         missions, model = tb.logs.read_tracks(*tables, window=window), MODELS["counts"]
         model = model.for_features(missions[0].features)
         none = replace(model, priors=replace(model.priors, beta0=dist.Beta(1.0, 1e6)))
-        carried, other = (tb.fit(missions, m, progress=False, whole=False) for m in (model, none))
+        carried, other = (tb.fit(missions, m, progress=False, latent=False) for m in (model, none))
         factor = carried.attrs["log_evidence"] - other.attrs["log_evidence"]
         beta0 = float(carried["posterior"]["beta0"].mean())
         table.row(f"{window:g} s", name, f"{factor:.1f}", f"{beta0:.2f}")

@@ -49,7 +49,7 @@ def measured(data, n_seeds):
     for seed in range(n_seeds):
         started = time.process_time()
         fitted = tb.fit(
-            data, sampler="nuts", seed=seed, whole=False, check=False, progress=False
+            data, sampler="nuts", seed=seed, latent=False, check=False, progress=False
         )  # fmt: skip
         cpu.append(time.process_time() - started)
         attrs.append(fitted.attrs)

@@ -50,7 +50,7 @@ def soh(folder):
             of = [truth[train, 1][success[train] == k].mean() for k in (False, True)]
             after = np.array(of)[success[test].astype(int)][:, None] * np.ones(3)
             errors["three means"].append(np.abs(np.stack([before, after], 1) - truth[test]).mean())
-            tree = tb.fit([people[i] for i in train], HumanTrust(scale="likert7"), whole=False)
+            tree = tb.fit([people[i] for i in train], HumanTrust(scale="likert7"), latent=False)
             for method, known in (("tasks and outcomes", "none"), ("own ratings", "earlier")):
                 found = predict_reports(tree, [people[i] for i in test], given=known)
                 guess = median_of(found["probability"].values, expit(LEVELS - 2.5))[:, :, 2:]
@@ -88,8 +88,10 @@ def azevedo(folder):
     own = expit(LEVELS - 3.0)
     answer = np.round(np.array([people[i].contact_rate[2, 0] for i in out]) * 6.0).astype(int)
     for name, model in models.items():
-        tb.fit(known, model, whole=False, progress=False)  # compiles
-        seconds, tree = timed(lambda model=model: tb.fit(known, model, whole=False, progress=False))
+        tb.fit(known, model, latent=False, progress=False)  # compiles
+        seconds, tree = timed(
+            lambda model=model: tb.fit(known, model, latent=False, progress=False)
+        )
         found = predict_reports(tree, [people[i] for i in out], fitted=True, n_draws=8000)
         found = found["probability"].values[:, 2, 0]
         log = np.log(found[np.arange(len(out)), answer]).mean()

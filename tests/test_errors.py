@@ -100,6 +100,10 @@ MISTAKES = {
     "no cases": (lambda w: tb.study.run_grid({}, {}, "study"), "case"),
     "a column as a number": (lambda w: tb.logs.read_reports({}, person=3, inputs=["x"]), "person"),
 }
+RENAMED = {
+    "latent": (lambda w: fit([made()], whole=False), "whole"),
+}
+"""Calls with an old name, by the new name, with the old name."""
 HUGE = {
     "n_robots": lambda w, n: tb.Team(n),
     "draws": lambda w, n: fit([made()], draws=n),
@@ -127,6 +131,18 @@ def test_bad_input_is_refused_by_name(mistake, workspace, tmp_path, monkeypatch)
         make(workspace)
     assert "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("new", RENAMED)
+def test_an_old_name_is_answered_with_the_new_one(new, workspace):
+    call, old = RENAMED[new]
+    with pytest.raises(tb.TrustboError, match=rf"{old}'? is now called '{new}'"):
+        call(workspace)
+
+
+def test_other_names_are_refused_as_python_does():
+    with pytest.raises(TypeError, match="wholly"):
+        fit([made()], wholly=False)
 
 
 ONE = (1, 1.0, True, np.int8(1), np.float32(1.0), np.array(1.0), jnp.asarray(1.0))

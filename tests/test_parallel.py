@@ -72,7 +72,7 @@ def test_all_that_is_computed_from_missions_is_computed_by_one_thread():
     model = PooledTrust(effects=(WatchedEffect(),))
     with ThreadPoolExecutor(2) as pool:
         fits = [
-            pool.submit(tb.fit, missions, model, seed=seed, draws=50, check=False, whole=False)
+            pool.submit(tb.fit, missions, model, seed=seed, draws=50, check=False, latent=False)
             for seed in range(2)
         ]
     posterior = complete(fits[0].result())

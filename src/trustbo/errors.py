@@ -1,9 +1,11 @@
 """Errors that trustbo raises for invalid input; each is also a ValueError."""
 
+import functools
+import inspect
 import math
 import operator
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -173,3 +175,68 @@ def require_pair(what: str, value: object) -> tuple[int, int]:
     except (TypeError, ValueError):
         raise TrustboError(f"{what} must be two whole numbers (row, col); got {value!r}.") from None
     return first, second
+
+
+class Renamed:
+    """Decorator for a function or class whose arguments got new names.
+
+    A call with an old name raises a TrustboError that gives the new one. If a class is decorated,
+    its attributes have the new names, too.
+
+    Example:
+        >>> @Renamed(whole="latent")
+        >>> def fit(missions, latent=True): ...
+    """
+
+    def __init__(self, **new_names: str) -> None:
+        self._new_names = new_names
+
+    def __call__[T: Callable[..., Any]](self, decorated: T) -> T:
+        """Return the function or class with checks for the old names."""
+        if not inspect.isclass(decorated):
+            return self._checked(decorated)
+
+        owner: Any = decorated
+        owner.__init__ = self._checked(owner.__init__)
+        owner.__getattr__ = self._refuse_attribute
+        return owner
+
+    def _checked(self, function: Any) -> Any:
+        """Wrap a function to refuse arguments with old names."""
+        name = function.__qualname__.removesuffix(".__init__")
+
+        @functools.wraps(function)
+        def checked(*args: Any, **options: Any) -> Any:
+            for old in self._new_names.keys() & options:
+                raise TrustboError(f"{name}: {old!r} is now called {self._new_names[old]!r}.")
+            return function(*args, **options)
+
+        return checked
+
+    @property
+    def _refuse_attribute(self) -> Callable[[Any, str], Any]:
+        """A method `__getattr__`, which Python calls for attributes that do not exist."""
+        new_names = self._new_names
+
+        def refuse(owner: Any, name: str) -> Any:
+            kind = type(owner).__name__
+            if name in new_names:
+                raise RenamedAttributeError(f"{kind}.{name} is now called {new_names[name]!r}.")
+            raise AttributeError(f"{kind!r} object has no attribute {name!r}", name=name, obj=owner)
+
+        return refuse
+
+
+class RenamedAttributeError(TrustboError, AttributeError):
+    """Error for the old name of an attribute; `hasattr` is False, as for other missing names."""
+
+
+def renamed_names(module: str, **new_names: str) -> Callable[[str], Any]:
+    """Return a module's `__getattr__` that raises a TrustboError for old names in the module."""
+
+    def refuse(name: str) -> Any:
+        if name in new_names:
+            raise TrustboError(f"{module}.{name} is now called {new_names[name]!r}.")
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+
+    return refuse

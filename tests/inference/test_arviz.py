@@ -82,7 +82,7 @@ def test_every_draw_has_a_likelihood_and_draws_with_trust_have_predictions(poste
 
 def test_the_effective_sample_size_is_that_of_the_weights(missions):
     for draws in (250, 1000):
-        posterior = tb.fit(missions, PooledTrust(), draws=draws, whole=False)
+        posterior = tb.fit(missions, PooledTrust(), draws=draws, latent=False)
         assert posterior["posterior"].sizes["chain"] == 1
         ess = az.ess(posterior, var_names=["beta0", "delta_w", "delta_v"], method="mean")
         least = min(float(values) for values in ess.data_vars.values())
@@ -92,7 +92,7 @@ def test_the_effective_sample_size_is_that_of_the_weights(missions):
 
 @pytest.mark.parametrize("model", [HierarchicalTrust(), CoupledTrust()])
 def test_a_summary_of_all_variables_labels_them_as_one_of_each_does(missions, model):
-    posterior = tb.fit(missions, model, draws=50, whole=False, check=False)
+    posterior = tb.fit(missions, model, draws=50, latent=False, check=False)
     together = az.summary(posterior, kind="stats", round_to="none")["mean"]
     for name, values in posterior["posterior"].data_vars.items():
         alone = az.summary(posterior, var_names=[name], kind="stats", round_to="none")["mean"]

@@ -26,7 +26,7 @@ def same(one, other):
 @pytest.mark.parametrize("model", [PooledTrust(), CoupledTrust()])
 def test_it_adds_what_fit_adds_at_once(missions, model, tmp_path):
     whole = fit(missions, model, seed=4, draws=250, check=False)
-    bare = fit(missions, model, seed=4, draws=250, check=False, whole=False)
+    bare = fit(missions, model, seed=4, draws=250, check=False, latent=False)
     assert "latent" not in bare.children
     assert complete(whole) is whole
     same(complete(bare), whole)

@@ -70,8 +70,8 @@ def test_a_posterior_completed_later_is_the_same(posterior, missions):
 def test_a_fit_started_at_a_posterior_agrees_and_the_start_of_another_model_is_ignored(
     posterior, missions
 ):
-    fewer = fit(missions[:-1], PooledTrust(), whole=False)
-    started = fit(missions, PooledTrust(), whole=False, start=fewer)
+    fewer = fit(missions[:-1], PooledTrust(), latent=False)
+    started = fit(missions, PooledTrust(), latent=False, start=fewer)
     assert "proposal" in started["sample_stats"].attrs
     over = ("chain", "draw")
     one, other = started["posterior"].to_dataset(), posterior["posterior"].to_dataset()
@@ -80,8 +80,8 @@ def test_a_fit_started_at_a_posterior_agrees_and_the_start_of_another_model_is_i
     assert float(gap.to_dataarray().max()) < 4.0 * error
     assert started.attrs["log_evidence"] == pytest.approx(posterior.attrs["log_evidence"], abs=0.2)
 
-    of_robots = fit(missions, HierarchicalTrust(), whole=False, **QUIET)
-    same = fit(missions, PooledTrust(), whole=False, start=of_robots)
+    of_robots = fit(missions, HierarchicalTrust(), latent=False, **QUIET)
+    same = fit(missions, PooledTrust(), latent=False, start=of_robots)
     xr.testing.assert_identical(same["posterior"].to_dataset(), posterior["posterior"].to_dataset())
 
 
@@ -124,12 +124,12 @@ def test_constant_rates_have_a_posterior(missions, y):
         tb.Mission.from_arrays(m.path, m.awareness, np.full_like(m.contact_rate, y))
         for m in missions
     ]
-    posterior = fit(flat, PooledTrust(), check=False, whole=False, **QUIET)
+    posterior = fit(flat, PooledTrust(), check=False, latent=False, **QUIET)
     assert float(posterior["posterior"]["delta_v"].min()) >= posterior.attrs["resolution"]
 
 
 def test_features_and_robots_are_put_in_order_by_name(missions):
-    posterior = fit(missions, HierarchicalTrust(), whole=False, **QUIET)
+    posterior = fit(missions, HierarchicalTrust(), latent=False, **QUIET)
     z = np.random.default_rng(0).uniform(size=(3, 4, 4, 2))
     workspace = tb.Workspace.from_awareness(z)
     turned = posterior.isel(feature=[1, 0], robot=[2, 0, 1])
@@ -138,7 +138,7 @@ def test_features_and_robots_are_put_in_order_by_name(missions):
 
 
 def test_posteriors_of_others_are_refused_by_name(missions):
-    posterior = fit(missions, HierarchicalTrust(), whole=False, **QUIET)
+    posterior = fit(missions, HierarchicalTrust(), latent=False, **QUIET)
     rng = np.random.default_rng(0)
     other = tb.Workspace.from_awareness(rng.uniform(size=(2, 4, 4, 2)))
     with pytest.raises(TrustboError, match="robots"):
@@ -181,7 +181,7 @@ def test_mistakes_are_refused_before_sampling(missions):
 
 def test_nuts_samples_a_single_chain(missions):
     size = {"chains": 1, "draws": 10, "warmup": 10, "progress": False, "check": False}
-    found = fit(missions[:2], PooledTrust(), sampler="nuts", whole=False, **size)
+    found = fit(missions[:2], PooledTrust(), sampler="nuts", latent=False, **size)
     assert dict(found["posterior"].sizes)["chain"] == 1
     assert dict(found["posterior"].sizes)["draw"] == 10
 
@@ -202,7 +202,7 @@ def test_nuts_and_importance_sampling_agree(missions, model, monkeypatch):
     more = {"size": 8192, "enough": 6000.0, "most": 12}
     exact = lambda *args, **options: importance.sample(*args, **options | more)  # noqa: E731
     monkeypatch.setattr(sys.modules["trustbo.inference.fit"], "sample", exact)
-    size, over = {"progress": False, "whole": False, "check": False}, ("chain", "draw")
+    size, over = {"progress": False, "latent": False, "check": False}, ("chain", "draw")
     found = fit(missions, model, draws=20_000, **size)
     ours, kish = found["posterior"].to_dataset(), found.attrs["kish"]
     nuts = fit(missions, model, sampler="nuts", draws=3000, **size)["posterior"].to_dataset()

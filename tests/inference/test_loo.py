@@ -113,9 +113,9 @@ def test_a_mission_whose_weights_fail_is_left_out_of_a_refit(monkeypatch):
 )
 def test_every_model_is_left_out_as_its_evidence_says(model):
     missions = simulate_missions(5, lengths=(8,))
-    posterior = fit(missions, model, progress=False, whole=False)
+    posterior = fit(missions, model, progress=False, latent=False)
     result = loo(posterior)
-    rest = fit(missions[:-1], model, seed=7, progress=False, whole=False)
+    rest = fit(missions[:-1], model, seed=7, progress=False, latent=False)
     expected = posterior.attrs["log_evidence"] - rest.attrs["log_evidence"]
     # Two evidences, of some 200 effective points each.
     assert float(result.elpd_i[-1]) == pytest.approx(expected, abs=0.5)
@@ -165,6 +165,6 @@ def test_compare_ranks_as_arviz_does_and_refuses_other_missions():
         ]
         for n in (10, None)
     ]
-    counted, uncounted = (fit(given, PooledTrust(), whole=False, check=False) for given in ticks)
+    counted, uncounted = (fit(given, PooledTrust(), latent=False, check=False) for given in ticks)
     with pytest.raises(TrustboError, match="tick"):
         compare({"counted": counted, "uncounted": uncounted})

@@ -69,7 +69,7 @@ def test_memory_is_found_where_it_is_and_not_where_it_is_not(model):
     models = model, without_memory(model)
     for beta0 in (0.5, 0.0):
         missions = missions_with(beta0)
-        fits = [tb.fit(missions, m, whole=False) for m in models]
+        fits = [tb.fit(missions, m, latent=False) for m in models]
         with_memory, without = (fit.attrs["log_evidence"] for fit in fits)
         if beta0:
             assert with_memory - without > 3.0
@@ -89,9 +89,9 @@ def deviations():
 def test_deviations_that_last_are_told_from_trust_that_does(deviations):
     models = PooledTrust(memory="deviation"), PooledTrust()
     for missions, sign in ((deviations, 1.0), (missions_with(0.7, 5), -1.0)):
-        right, wrong = (tb.fit(missions, model, whole=False) for model in models)
+        right, wrong = (tb.fit(missions, model, latent=False) for model in models)
         assert sign * (right.attrs["log_evidence"] - wrong.attrs["log_evidence"]) > 5.0
-    fitted = tb.fit(deviations, models[0], whole=False)["posterior"]["beta0"]
+    fitted = tb.fit(deviations, models[0], latent=False)["posterior"]["beta0"]
     assert abs(float(fitted.mean()) - 0.8) < 4.0 * float(fitted.std())
 
 

@@ -62,7 +62,7 @@ def test_persons_left_out_have_even_weights(posterior):
 def test_predictions_are_those_of_the_joint_normal_of_draws():
     """On the unit scale within the limits: Gaussian conditioning of a person under each draw."""
     persons = simulated(n=8, scale="unit")
-    posterior = fit(persons, HumanTrust(), draws=100, progress=False, whole=False, check=False)
+    posterior = fit(persons, HumanTrust(), draws=100, progress=False, latent=False, check=False)
     new = simulated(n=1, scale="unit", seed=9)[0]
     y = np.full((6, 1), np.nan)
     y[:4, 0] = 0.5, 0.6, 0.45, 0.55
@@ -106,7 +106,7 @@ def test_own_reports_help(persons, posterior):
 
 def test_numbers_at_the_ends_are_limits():
     people = simulated(n=20, scale="unit", seed=4)
-    found = predict_reports(fit(people, HumanTrust(), progress=False, whole=False), people)
+    found = predict_reports(fit(people, HumanTrust(), progress=False, latent=False), people)
     assert found.attrs["mae"] < 0.2
     assert np.isfinite(found["log_score"].values).all()
 
@@ -119,8 +119,8 @@ def test_what_is_not_of_these_people_is_refused(posterior, persons):
     with pytest.raises(TrustboError, match="at least one mission"):
         predict_reports(posterior, [])
     with pytest.raises(TrustboError):
-        predict_reports(fit(persons, PooledTrust(), progress=False, whole=False), persons)
+        predict_reports(fit(persons, PooledTrust(), progress=False, latent=False), persons)
     with pytest.raises(TrustboError, match="levels"):
-        fit(persons, HumanTrust(scale="likert5"), progress=False, whole=False)
+        fit(persons, HumanTrust(scale="likert5"), progress=False, latent=False)
     with pytest.raises(TrustboError):
         tb.check(posterior, persons)

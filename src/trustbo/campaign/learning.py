@@ -84,7 +84,7 @@ def learn(
             workspace=workspace,
             seed=seed,
             progress=progress,
-            whole=False,
+            latent=False,
             start=_previous(state),
             **(usual | options),
         )

@@ -32,7 +32,7 @@ def require_options(what: str, options: Any) -> dict[str, Any]:
 def require_options_of_fit(options: Mapping[str, Any]) -> None:
     """Raise TypeError for options that `fit` does not have, or that the campaign sets itself."""
     own = {"model": None, "sampler": None, "workspace": None, "seed": 0}
-    _FIT.bind([], **own, progress=True, whole=False, **options)
+    _FIT.bind([], **own, progress=True, latent=False, **options)
 
 
 def require_model(model: Any) -> TrustModel:

@@ -12,6 +12,7 @@ from trustbo.data import Mission
 from trustbo.display import slow_bar
 from trustbo.errors import (
     PosteriorError,
+    Renamed,
     TrustboError,
     require_choice,
     require_count,
@@ -55,6 +56,7 @@ _MANY_SCORES = 12
 """Number of scores from which a round has four times as many points."""
 
 
+@Renamed(whole="latent")
 @computing()
 def fit(
     missions: Sequence[Mission],
@@ -68,7 +70,7 @@ def fit(
     seed: int = 0,
     progress: bool = True,
     check: bool = True,
-    whole: bool = True,
+    latent: bool = True,
     start: xr.DataTree | None = None,
 ) -> xr.DataTree:
     """Fit a trust model to missions, and return the posterior of parameters and latent trust.
@@ -95,7 +97,7 @@ def fit(
         progress: Whether to show a progress bar; importance sampling shows it after 5 seconds.
         check: Whether to raise an error if diagnostics are bad: k-hat > 0.7 for importance
             sampling; R-hat > 1.01, bulk ESS < 400 or any divergence for NUTS.
-        whole: Whether to add latent trust, log-likelihoods and predictions, as `complete` does.
+        latent: Whether to add latent trust, log-likelihoods and predictions, as `complete` does.
         start: Posterior of the same model given similar data, such as all missions but the last.
             Importance sampling then begins with its proposal instead of a search for the mode.
 
@@ -178,7 +180,7 @@ def fit(
             "get the posterior anyway, pass check=False.",
         )
 
-    if whole:
+    if latent:
         as_read = draws_of(density, variables)  # equal to those that `complete` reads from a file
         tree = with_latent(tree, missions, density, as_read, progress=progress)
     tree.attrs["seconds"] = time.perf_counter() - started
