@@ -405,7 +405,7 @@ def of_inference() -> list[Call]:
         Call("compare", tb.compare, compared),
         Call("check", tb.check, checked),
         Call("inference.loo", tb.inference.loo, {"posterior": posterior(), "model": POOLED}),
-        Call("inference.complete", tb.inference.complete, whole),
+        Call("inference.add_latent", tb.inference.add_latent, whole),
         Call("inference.params_of", tb.inference.params_of, params),
         Call("inference.sample_prior", tb.inference.sample_prior, prior),
         Call("inference.score", tb.inference.score, scored),

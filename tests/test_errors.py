@@ -102,6 +102,7 @@ MISTAKES = {
 }
 RENAMED = {
     "latent": (lambda w: fit([made()], whole=False), "whole"),
+    "add_latent": (lambda w: tb.inference.complete(None), "complete"),
 }
 """Calls with an old name, by the new name, with the old name."""
 HUGE = {

@@ -9,7 +9,7 @@ from missions import walking_missions
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import trustbo as tb
-from trustbo.inference import complete, loo, params_of
+from trustbo.inference import add_latent, loo, params_of
 from trustbo.models import PooledTrust, RobotEffect
 from trustbo.parallel import one_blas_thread
 
@@ -75,7 +75,7 @@ def test_all_that_is_computed_from_missions_is_computed_by_one_thread():
             pool.submit(tb.fit, missions, model, seed=seed, draws=50, check=False, latent=False)
             for seed in range(2)
         ]
-    posterior = complete(fits[0].result())
+    posterior = add_latent(fits[0].result())
     loo(posterior)
     params_of(posterior)
     assert WatchedEffect.SEEN == {1}

@@ -1,4 +1,4 @@
-"""Every model with every observation family and effect is fitted and completed."""
+"""Every model with every family and effect is fitted, and latent trust is added later."""
 
 from itertools import product
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import trustbo as tb
-from trustbo.inference import complete
+from trustbo.inference import add_latent
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect
 
@@ -70,6 +70,6 @@ def test_a_fit_has_trust_predictions_and_likelihoods_of_all_rates(name, missions
     assert of_missions.shape == (1, N_DRAWS, 3)
     assert np.isfinite(of_missions).all()
 
-    later = complete(parameters_alone(fitted), missions, progress=False)
+    later = add_latent(parameters_alone(fitted), missions, progress=False)
     for group in ("latent", "posterior_predictive", "log_likelihood", "log_prior"):
         assert later[group].to_dataset().equals(fitted[group].to_dataset()), group

@@ -11,7 +11,7 @@ from missions import walking_missions
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.inference import complete, fit, importance, params_of, sample_prior
+from trustbo.inference import add_latent, fit, importance, params_of, sample_prior
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.draws import prior_mean, read_posterior
 from trustbo.inference.tree import parameters_alone
@@ -61,8 +61,8 @@ def test_the_same_seed_gives_the_same_posterior(posterior, missions):
         xr.testing.assert_identical(again[group].to_dataset(), posterior[group].to_dataset())
 
 
-def test_a_posterior_completed_later_is_the_same(posterior, missions):
-    later = complete(parameters_alone(posterior), missions)
+def test_latent_trust_added_later_is_the_same(posterior, missions):
+    later = add_latent(parameters_alone(posterior), missions)
     for group in ("latent", "log_likelihood", "prior_predictive", "log_prior"):
         xr.testing.assert_identical(later[group].to_dataset(), posterior[group].to_dataset())
 

@@ -21,7 +21,7 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_kind
 from trustbo.files import FilePath, interpreting, to_path
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference import complete, params_of, sample_prior
+from trustbo.inference import add_latent, params_of, sample_prior
 from trustbo.inference.draws import prior_mean
 from trustbo.models.backend import VERSIONS
 from trustbo.models.model import TrustModel
@@ -121,7 +121,7 @@ class Result(Summary):
         """Posterior after the last mission, with all groups, for ArviZ.
 
         Its missions are labelled by their index in `missions`. To add all groups to an earlier
-        posterior, use `inference.complete`.
+        posterior, use `inference.add_latent`.
 
         Raises:
             TrustboError: Nothing could be learned yet.
@@ -135,7 +135,7 @@ class Result(Summary):
 
         indices = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
         # The group `log_prior` requires the model if its priors are not the defaults.
-        whole = complete(stored, [self.missions[j] for j in indices], model=self.model)
+        whole = add_latent(stored, [self.missions[j] for j in indices], model=self.model)
 
         for group in whole.children.values():
             if "mission" in group.dims:

@@ -3,18 +3,19 @@
 from trustbo.models import backend as backend  # imported first because it loads numpyro
 
 # isort: split
+from trustbo.errors import renamed_names
 from trustbo.inference.draws import params_of, sample_prior
 from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.loo import compare, loo
 from trustbo.inference.reports import predict_reports
 from trustbo.inference.score import score
-from trustbo.inference.tree import complete
+from trustbo.inference.tree import add_latent
 
 __all__ = [
     "TrustFilter",
+    "add_latent",
     "compare",
-    "complete",
     "fit",
     "loo",
     "params_of",
@@ -22,4 +23,5 @@ __all__ = [
     "sample_prior",
     "score",
 ]
+__getattr__ = renamed_names(__name__, complete="add_latent")
 __dir__ = __all__.copy  # tab completion lists only public names

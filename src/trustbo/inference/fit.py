@@ -97,7 +97,7 @@ def fit(
         progress: Whether to show a progress bar; importance sampling shows it after 5 seconds.
         check: Whether to raise an error if diagnostics are bad: k-hat > 0.7 for importance
             sampling; R-hat > 1.01, bulk ESS < 400 or any divergence for NUTS.
-        latent: Whether to add latent trust, log-likelihoods and predictions, as `complete` does.
+        latent: Whether to add latent trust, log-likelihoods and predictions, as `add_latent` does.
         start: Posterior of the same model given similar data, such as all missions but the last.
             Importance sampling then begins with its proposal instead of a search for the mode.
 
@@ -181,7 +181,7 @@ def fit(
         )
 
     if latent:
-        as_read = draws_of(density, variables)  # equal to those that `complete` reads from a file
+        as_read = draws_of(density, variables)  # equal to what `add_latent` reads from a file
         tree = with_latent(tree, missions, density, as_read, progress=progress)
     tree.attrs["seconds"] = time.perf_counter() - started
     return tree

@@ -133,7 +133,7 @@ def _data_groups(
 
 
 def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
-    """Drop the groups that grow with the number of missions; see `complete`."""
+    """Drop the groups that grow with the number of missions; see `add_latent`."""
     kept = [*_KEPT, *(effect.group for effect in effects_of(posterior))]
     kept = [name for name in kept if name in posterior.children]
 
@@ -143,7 +143,7 @@ def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
 
 
 @computing()
-def complete(
+def add_latent(
     posterior: xr.DataTree,
     missions: Sequence[Mission] | None = None,
     *,
@@ -168,7 +168,7 @@ def complete(
     Raises:
         TrustboError: If the posterior contains no data and no missions are given.
     """
-    if "latent" in require_posterior("complete", posterior).children:
+    if "latent" in require_posterior("add_latent", posterior).children:
         return posterior
 
     missions = missions_of(posterior) if missions is None else missions
@@ -184,13 +184,13 @@ def with_latent(
     *,
     progress: bool = True,
 ) -> xr.DataTree:
-    """Add latent trust, log-likelihoods and predictions to a posterior; see `complete`.
+    """Add latent trust, log-likelihoods and predictions to a posterior; see `add_latent`.
 
     Args:
         posterior: DataTree with the parameters.
         missions: Fitted missions.
         fitted: Density of the model given the missions.
-        draws: Draws as read from the posterior, so that `complete` gives the same later.
+        draws: Draws as read from the posterior, so that `add_latent` gives the same later.
         progress: Whether to show a progress bar after 5 seconds.
     """
     fitted.reset_ep()

@@ -91,7 +91,7 @@ def _latent_trust(
     require_posterior("trust_curves", posterior)
     if "latent" not in posterior.children:
         raise TrustboError(
-            "this posterior has no latent trust; use inference.complete(posterior, missions)."
+            "this posterior has no latent trust; use inference.add_latent(posterior, missions)."
         )
 
     latent = posterior["latent"].to_dataset()

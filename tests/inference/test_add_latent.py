@@ -1,4 +1,4 @@
-"""`complete`: what a posterior of parameters alone lacks, the same whenever it is computed."""
+"""`add_latent`: what a posterior of parameters alone lacks, the same whenever it is computed."""
 
 import jax
 import numpy as np
@@ -8,7 +8,7 @@ from missions import simulate_missions
 from numpyro.distributions import HalfCauchy
 
 from trustbo.errors import TrustboError
-from trustbo.inference import complete, fit, sample_prior
+from trustbo.inference import add_latent, fit, sample_prior
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors
 
 
@@ -28,20 +28,20 @@ def test_it_adds_what_fit_adds_at_once(missions, model, tmp_path):
     whole = fit(missions, model, seed=4, draws=250, check=False)
     bare = fit(missions, model, seed=4, draws=250, check=False, latent=False)
     assert "latent" not in bare.children
-    assert complete(whole) is whole
-    same(complete(bare), whole)
+    assert add_latent(whole) is whole
+    same(add_latent(bare), whole)
     bare.to_netcdf(tmp_path / "bare.nc")
     with xr.open_datatree(tmp_path / "bare.nc") as read:
-        same(complete(read.load()), whole)
+        same(add_latent(read.load()), whole)
     # As a campaign keeps its earlier ones.
     alone = xr.DataTree.from_dict(
         {name: bare[name].to_dataset() for name in ("posterior", "sample_stats", "prior")}
     )
     alone.attrs = bare.attrs
     with pytest.raises(TrustboError):
-        complete(alone)
+        add_latent(alone)
     xr.testing.assert_identical(
-        complete(alone, missions)["latent"].to_dataset(), whole["latent"].to_dataset()
+        add_latent(alone, missions)["latent"].to_dataset(), whole["latent"].to_dataset()
     )
 
 
