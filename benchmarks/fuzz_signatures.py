@@ -451,7 +451,7 @@ def of_planning() -> list[Call]:
 
     start = np.full(3, 0.5)
     some = {"posterior": draws(), "n_draws": 5, "seed": 0}
-    rolled = {"params": PARAMS, "awareness": mission().awareness, "x0": start}
+    along_path = {"params": PARAMS, "awareness": mission().awareness, "x0": start}
     avoided = {"bounds": np.zeros((8, 4, 4), bool), "risk": p_fail}
     p = planner()
     return [
@@ -466,7 +466,7 @@ def of_planning() -> list[Call]:
         Call("planning.Planner.with_risk", at_risk, {"p_fail": p_fail, "draws": p_fail[None]}),
         Call("planning.Planner.with_failure_cost", at_cost, {"failure_cost": 1.0}),
         Call("planning.Planner.avoiding", avoiding, avoided),
-        Call("planning.roll_trust", tb.planning.roll_trust, rolled),
+        Call("planning.expected_trust", tb.planning.expected_trust, along_path),
         *map(by_policy, ("greedy", "thompson", "optimistic", "ucb", "random")),
     ]
 

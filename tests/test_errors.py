@@ -84,8 +84,8 @@ MISTAKES = {
         "quantile",
     ),
     "a map of risk of another shape": (lambda w: Planner(w, *ENDS).avoiding(Z, Z), "bounds"),
-    "x0 of another team": (lambda w: tb.planning.roll_trust(PARAMS, Z, [0.5, 0.5]), "x0"),
-    "None for parameters": (lambda w: tb.planning.roll_trust(None, Z), "params"),
+    "x0 of another team": (lambda w: tb.planning.expected_trust(PARAMS, Z, [0.5, 0.5]), "x0"),
+    "None for parameters": (lambda w: tb.planning.expected_trust(None, Z), "params"),
     "no missions to replay": (lambda w: ReplaySimulator([]), "missions"),
     "a number for a mission": (lambda w: w.fill(3), "mission"),
     "a number for a simulated workspace": (lambda w: KinematicSimulator(3), "workspace"),
@@ -103,6 +103,7 @@ MISTAKES = {
 RENAMED = {
     "latent": (lambda w: fit([made()], whole=False), "whole"),
     "add_latent": (lambda w: tb.inference.complete(None), "complete"),
+    "expected_trust": (lambda w: tb.planning.roll_trust(PARAMS, Z), "roll_trust"),
 }
 """Calls with an old name, by the new name, with the old name."""
 HUGE = {

@@ -9,7 +9,7 @@ from trustbo.errors import TrustboError
 from trustbo.inference import fit, params_of, sample_prior
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.models import PooledTrust, TrustParams
-from trustbo.planning import Planner, reference, roll_trust
+from trustbo.planning import Planner, expected_trust, reference
 from trustbo.planning.paths import STEPS
 from trustbo.simulation import ModelSimulator
 from trustbo.workspace import Workspace
@@ -34,19 +34,19 @@ def draws():
 
 def trust_along(workspace, params, path):
     """Trust of the team along a path, rolled."""
-    return roll_trust(params, workspace.along(path)).mean(-1)
+    return expected_trust(params, workspace.along(path)).mean(-1)
 
 
 def test_expected_trust_follows_equation_3():
     z = np.random.default_rng(1).uniform(size=(4, 2, 2))
-    trust, x = roll_trust(PARAMS, z, x0=0.3), np.full(2, 0.3)
+    trust, x = expected_trust(PARAMS, z, x0=0.3), np.full(2, 0.3)
     for k in range(4):
         x = 0.6 * x + z[k] @ [0.3, 0.2] + 0.05
         np.testing.assert_allclose(trust[k], x)
     many = TrustParams(*(np.stack([v, v]) for v in PARAMS[:5]), 0.3, 0.5)
-    np.testing.assert_allclose(roll_trust(many, z)[1], trust)
+    np.testing.assert_allclose(expected_trust(many, z)[1], trust)
     with pytest.raises(TrustboError):
-        roll_trust(PARAMS, np.zeros((4, 2, 3)))
+        expected_trust(PARAMS, np.zeros((4, 2, 3)))
 
 
 def test_a_plan_has_the_trust_and_the_value_of_its_path(workspace, draws):
@@ -248,4 +248,4 @@ def test_unsafe_parameters_are_refused(workspace, field, value):
     with pytest.raises(TrustboError, match=field):
         Planner(workspace, *ENDS).plan(params)
     with pytest.raises(TrustboError, match=field):
-        roll_trust(params, np.zeros((4, 3, 2)))
+        expected_trust(params, np.zeros((4, 3, 2)))

@@ -5,7 +5,7 @@ import pytest
 
 from trustbo.inference import sample_prior
 from trustbo.models import HierarchicalTrust, PooledTrust
-from trustbo.planning import Planner, reference, roll_trust
+from trustbo.planning import Planner, expected_trust, reference
 from trustbo.workspace import Workspace
 
 ENDS = (3, 0), (0, 3)
@@ -32,7 +32,7 @@ def test_a_trust_map_is_the_best_of_all_paths_to_each_cell(workspace, model):
         last = []
         for path in reference.every_path(planner.problem.paths.to((row, col), 2)):
             z = workspace.along(path)
-            last.append(roll_trust(draws, z)[:, -1])
+            last.append(expected_trust(draws, z)[:, -1])
         last = np.stack(last)  # (path, draw, robot)
         np.testing.assert_allclose(maps[:, row, col], last.mean(-1).max(0), rtol=1e-12)
         np.testing.assert_allclose(by_robot[:, :, row, col], last.max(0), rtol=1e-12)

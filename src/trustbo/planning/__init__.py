@@ -1,5 +1,6 @@
 """Search for the most trustworthy path, given a posterior of the trust model."""
 
+from trustbo.errors import renamed_names
 from trustbo.planning import policies, reference
 from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.paths import NoPathError
@@ -7,10 +8,18 @@ from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.policies import POLICIES
 from trustbo.planning.problem import InfeasibleError
-from trustbo.planning.recursion import roll_trust
+from trustbo.planning.recursion import expected_trust
 
 __all__ = [
-    "OBJECTIVES", "POLICIES", "InfeasibleError", "NoPathError", "Plan", "Planner",
-    "policies", "reference", "roll_trust",
+    "OBJECTIVES",
+    "POLICIES",
+    "InfeasibleError",
+    "NoPathError",
+    "Plan",
+    "Planner",
+    "expected_trust",
+    "policies",
+    "reference",
 ]  # fmt: skip
+__getattr__ = renamed_names(__name__, roll_trust="expected_trust")
 __dir__ = __all__.copy  # tab completion lists only public names

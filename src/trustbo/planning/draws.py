@@ -11,7 +11,7 @@ from trustbo.errors import require_whole
 from trustbo.models.params import Params
 from trustbo.planning.objectives import capped
 from trustbo.planning.problem import EXACT, Problem
-from trustbo.planning.recursion import Recursion, roll
+from trustbo.planning.recursion import Recursion, states_along
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ class DrawnPaths:
         """Compute the value of a path for each draw of `recursion`, shape (draw,)."""
         problem = self.problem
         along = capped(problem.objective, problem.family, recursion.along(path))
-        value = problem.value_along(path, roll(along).mean(-1), along.noise_sd)
+        value = problem.value_along(path, states_along(along).mean(-1), along.noise_sd)
         return value - problem.failure_along(path)
 
     @cached_property

@@ -33,7 +33,7 @@ from trustbo.planning.problem import (
     mean_of,
     risk_of,
 )
-from trustbo.planning.recursion import Recursion, roll, trust_recursion
+from trustbo.planning.recursion import Recursion, states_along, trust_recursion
 from trustbo.planning.trust_map import cost_of, trust_map
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -479,7 +479,7 @@ def _value_along(
     z = z[:, None, None]  # a map with one move and one row, whose columns are the bounds
 
     by_robot = trust_recursion(of_path, z, x0, by_robot=True)
-    trust = roll(by_robot)
+    trust = states_along(by_robot)
     trust = trust.reshape(-1, *trust.shape[-2:])
     values = np.atleast_1d(problem.value_along(cells, trust.mean(-1), by_robot.noise_sd))
     if not problem.objective.of_contact:
@@ -489,5 +489,5 @@ def _value_along(
     # Capping the trust of each draw causes bias, so the value of each draw uses uncapped trust.
     # However, the contact lost on a path cannot be negative.
     team = capped(problem.objective, problem.family, trust_recursion(of_path, z, x0))
-    mean = problem.value_along(cells, roll(team).mean(-1), team.noise_sd).mean()
+    mean = problem.value_along(cells, states_along(team).mean(-1), team.noise_sd).mean()
     return trust, float(mean), np.minimum(values, -problem.toll_along(cells))

@@ -135,7 +135,7 @@ def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
     return u
 
 
-def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None) -> np.ndarray:
+def expected_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None) -> np.ndarray:
     """Compute expected trust along a path from equations (1) and (3) without noise.
 
     Args:
@@ -164,10 +164,10 @@ def roll_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None
         x0 = require_numbers("x0", x0)
 
     of_robots = np.swapaxes(z, 0, 1)
-    return roll(trust_recursion(params, of_robots[:, None, None], x0, by_robot=True))
+    return states_along(trust_recursion(params, of_robots[:, None, None], x0, by_robot=True))
 
 
-def roll(along: Recursion) -> np.ndarray:
+def states_along(along: Recursion) -> np.ndarray:
     """Compute expected trust (..., bound, state) after each bound of `Recursion.along(path)`."""
     drift = np.moveaxis(along.drift[..., 0, 0, :], -1, 0)  # (bound, ..., state)
     trust = [along.start]
