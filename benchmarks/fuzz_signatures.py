@@ -330,7 +330,7 @@ def of_models() -> list[Call]:
         "log_width": (0.0, 0.5),
         "log_strength": (-0.5, 1.0),
     }
-    robot = {"tau_slow": 0.2, "tau_day": 0.2, "rho": 0.9}
+    robot = {"tau_slow": 0.2, "tau_mission": 0.2, "rho": 0.9}
     numbers = {"concentration": 2.0, "x0_mean": 0.5, "x0_sd": 0.5, "stationary": False}
     of_names = {"features": ("a", "b"), "observation": "gaussian"}
     return [
@@ -381,7 +381,7 @@ def of_inference() -> list[Call]:
         "n_ticks": np.full(3, 20.0),
     }
     prior = {"model": POOLED, "n_features": 2, "n_draws": 5, "seed": 0, "n_robots": 1}
-    params = {"posterior": posterior(), "workspace": cells(), "day": False}
+    params = {"posterior": posterior(), "workspace": cells(), "next_mission": False}
     whole = {"posterior": posterior(), "missions": [mission(0), mission(1)], "model": POOLED}
     scored = {
         "posterior": posterior(),

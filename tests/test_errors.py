@@ -104,6 +104,8 @@ RENAMED = {
     "latent": (lambda w: fit([made()], whole=False), "whole"),
     "add_latent": (lambda w: tb.inference.complete(None), "complete"),
     "expected_trust": (lambda w: tb.planning.roll_trust(PARAMS, Z), "roll_trust"),
+    "next_mission": (lambda w: params_of(None, day=True), "day"),
+    "tau_mission": (lambda w: tb.models.RobotEffect(tau_day=0.1), "tau_day"),
 }
 """Calls with an old name, by the new name, with the old name."""
 HUGE = {

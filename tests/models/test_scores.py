@@ -57,4 +57,4 @@ def test_sizes_and_angles_of_a_half_normal_pair_give_back_the_pair(scores):
 def test_each_effect_with_two_standard_deviations_has_a_size():
     model = PooledTrust(effects=(PlaceEffect(), RobotEffect()))
     pairs = [(pair.first, pair.second) for effect in model.effects for pair in effect.pairs]
-    assert pairs == [("tau_s", "tau_e"), ("tau_slow", "tau_day")]
+    assert pairs == [("tau_s", "tau_e"), ("tau_slow", "tau_mission")]

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission, is_line_of_sight
-from trustbo.errors import TrustboError, require_count, require_kind, require_whole
+from trustbo.errors import Renamed, TrustboError, require_count, require_kind, require_whole
 from trustbo.inference.density import Density, Draws
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.inference.variables import draws_of, prior_parameters
@@ -25,7 +25,7 @@ from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Quantiles of predictions."""
-_DAY_SEED = 20261123
+_NEXT_MISSION_SEED = 20261123
 """Seed of the next mission's robot effects, so that bands are reproducible."""
 _N_MEAN = 4096
 """Number of draws averaged to compute a prior mean."""
@@ -105,17 +105,19 @@ def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarra
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also for 0 draws
 
 
+@Renamed(day="next_mission")
 @computing()
 def params_of(
-    posterior: xr.DataTree, workspace: Workspace | None = None, *, day: bool = False
+    posterior: xr.DataTree, workspace: Workspace | None = None, *, next_mission: bool = False
 ) -> Params:
     """Return all draws of a posterior as parameters, with chains joined in a leading axis (draw,).
 
     Args:
         posterior: DataTree from `fit`.
         workspace: Workspace for planning; features and robots are reordered to match the workspace.
-        day: Whether to draw the mission-specific robot effects of the next mission, for credible
-            bands and predicted rates. By default, expected effects are used, as planning needs.
+        next_mission: Whether to draw the robot effects of the next mission, including their
+            mission-specific part, for credible bands and predicted rates. By default, expected
+            effects are used, as planning needs.
 
     Returns:
         `TrustParams`, `RobotParams` or `CoupledParams`, depending on the model. A pooled model with
@@ -126,22 +128,22 @@ def params_of(
         TrustboError: If the posterior is not from `fit`; a variable is missing or has NaN draws; or
             features or robots differ from those of the workspace.
     """
-    return _read_params(posterior, workspace, [day])[0]
+    return _read_params(posterior, workspace, [next_mission])[0]
 
 
 @computing()
 def expected_and_drawn(
     posterior: xr.DataTree, workspace: Workspace | None = None
 ) -> tuple[Params, Params]:
-    """Return `params_of` without and with `day`, reading the posterior and drawing maps once."""
+    """Return `params_of` without and with `next_mission`; the posterior is read once."""
     expected, drawn = _read_params(posterior, workspace, [False, True])
     return expected, drawn
 
 
 def _read_params(
-    posterior: xr.DataTree, workspace: Workspace | None, days: Sequence[bool]
+    posterior: xr.DataTree, workspace: Workspace | None, next_mission: Sequence[bool]
 ) -> list[Params]:
-    """Return the parameters for each value of `day`; see `params_of`."""
+    """Return the parameters for each value of `next_mission`; see `params_of`."""
     if is_of_people(require_posterior("params_of", posterior)):
         raise TrustboError(
             "a posterior of HumanTrust cannot be used for planning; to predict reports, use "
@@ -167,15 +169,15 @@ def _read_params(
         maps = place_maps_of(posterior["places"].to_dataset(), sites)
 
     found = []
-    for day in days:
-        ahead = sites | _robot_effects_ahead(posterior, sites, day)
+    for is_drawn in next_mission:
+        ahead = sites | _robot_effects_ahead(posterior, sites, is_drawn)
         params = assemble_params(ahead, x0, memory)
         found.append(params._replace(**maps))  # pyright: ignore
     return found
 
 
 def _robot_effects_ahead(
-    posterior: xr.DataTree, sites: Mapping[str, np.ndarray], day: bool
+    posterior: xr.DataTree, sites: Mapping[str, np.ndarray], next_mission: bool
 ) -> dict[str, np.ndarray]:
     """Return the parameters (draw, robot, ...) that robot effects change in the next mission."""
     effects = [e for e in effects_of(posterior) if not isinstance(e, PlaceEffect)]
@@ -183,7 +185,7 @@ def _robot_effects_ahead(
         return {}
 
     theta = theta_of(posterior, sites)
-    rng = np.random.default_rng(_DAY_SEED) if day else None
+    rng = np.random.default_rng(_NEXT_MISSION_SEED) if next_mission else None
     n_draws = len(theta["inverse_gain"])
     n_robots = posterior.attrs["n_robots"]
     n_missions = posterior.attrs["n_missions"]

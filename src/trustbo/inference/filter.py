@@ -112,7 +112,7 @@ class TrustFilter:
             observation = posterior.attrs["observation"]
             if workspace is None:
                 self._names = {axis: names_in(posterior, axis) or None for axis in self._names}
-            posterior = params_of(posterior, workspace, day=True)
+            posterior = params_of(posterior, workspace, next_mission=True)
         elif not isinstance(posterior, Params):
             raise TrustboError(
                 "TrustFilter needs a posterior from fit or parameter draws; got "

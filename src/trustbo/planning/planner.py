@@ -277,7 +277,7 @@ class Planner(Summary):
         problem = self.problem
         path = self.require_path(path)
         cells = np.array(path)
-        draws = draws_of(params, self.workspace, day=True)
+        draws = draws_of(params, self.workspace, next_mission=True)
 
         trust, value, values = _value_along(problem, cells, draws, x0)
         cost = problem.failure_along(cells)

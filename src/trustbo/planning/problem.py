@@ -291,14 +291,17 @@ def risk_of(p_fail: np.ndarray) -> np.ndarray:
         return np.minimum(-np.log1p(-np.nan_to_num(p_fail)), _CERTAIN)
 
 
-def draws_of(posterior: Params | xr.DataTree, workspace: Workspace, *, day: bool = False) -> Params:
+def draws_of(
+    posterior: Params | xr.DataTree, workspace: Workspace, *, next_mission: bool = False
+) -> Params:
     """Return the draws of a posterior or parameters, with a leading axis (draw,) if there is one.
 
-    The features and robots of a posterior are reordered by name to match the workspace (for `day`,
-    see `params_of`). Raises TrustboError if the type, the features or the robots are wrong.
+    The features and robots of a posterior are reordered by name to match the workspace. See
+    `params_of` for `next_mission`. Raises TrustboError if the type, the features or the robots
+    are wrong.
     """
     if isinstance(posterior, xr.DataTree):
-        return params_of(posterior, workspace, day=day)
+        return params_of(posterior, workspace, next_mission=next_mission)
 
     remedy = "give a posterior from fit, or parameters"
     params: Params = require_kind("posterior", posterior, Params, remedy)
@@ -315,9 +318,10 @@ def mean_of(params: Params | xr.DataTree, workspace: Workspace) -> Params:
 def mean_and_draws_of(
     params: Params | xr.DataTree, workspace: Workspace
 ) -> tuple[Params, Params | None]:
-    """Return `mean_of`, and the draws for bands (`day`); None if there is only a single draw.
+    """Return `mean_of` and the draws for bands, or None if there is only a single draw.
 
-    A posterior is read once, which draws its maps of place effects once.
+    The draws are those of `params_of(next_mission=True)`. A posterior is read once, which
+    draws its maps of place effects once.
     """
     if isinstance(params, xr.DataTree):
         expected, drawn = expected_and_drawn(params, workspace)

@@ -4,7 +4,7 @@ For example, damage to a detector has a lasting effect, but rain does not. The s
 robot i in mission m has the additional term l d[i, m], where l is the predicted line of sight. The
 effect d is independent between robots and has the following covariance over missions:
 
-    cov(d[i, m], d[i, m']) = tau_slow^2 rho^|m - m'| + tau_day^2 [m = m'].
+    cov(d[i, m], d[i, m']) = tau_slow^2 rho^|m - m'| + tau_mission^2 [m = m'].
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,13 @@ import numpy as np
 from numpy.random import Generator
 from scipy import sparse
 
-from trustbo.errors import require_share
+from trustbo.errors import Renamed, require_share
 from trustbo.models.effects.effect import LEAST, Chains, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.statespace.matrices import namespace
 
 
+@Renamed(tau_day="tau_mission")
 @dataclass(frozen=True)
 class RobotEffect(Effect):
     """Effect of a robot in a mission, proportional to the predicted line of sight.
@@ -29,7 +30,7 @@ class RobotEffect(Effect):
 
     Attributes:
         tau_slow: Scale of the half-normal prior on the standard deviation of the persistent part.
-        tau_day: Scale of the half-normal prior on the sd of the mission-specific part.
+        tau_mission: Scale of the half-normal prior on the sd of the mission-specific part.
         rho: Correlation of the persistent part between consecutive missions.
 
     Raises:
@@ -37,9 +38,9 @@ class RobotEffect(Effect):
     """
 
     tau_slow: float = 0.2
-    tau_day: float = 0.2
+    tau_mission: float = 0.2
     rho: float = 0.9
-    names = ("tau_slow", "tau_day")
+    names = ("tau_slow", "tau_mission")
     group = "robots"
     variables: ClassVar = {"robot_effect": ("mission", "robot")}
 
@@ -61,9 +62,9 @@ class RobotEffect(Effect):
     def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return independent priors for the robots, as one array if their gain is the same."""
         inverse_gain = theta["inverse_gain"]
-        slow, day = self._variances(theta)
+        slow, mission = self._variances(theta)
         value, vector = _correlation_eigen(self.rho, observations.n_missions)
-        Q = (vector / (slow * value + day)[:, None]) @ vector.T
+        Q = (vector / (slow * value + mission)[:, None]) @ vector.T
 
         if inverse_gain.ndim == 1:
             return None, [Q / inverse_gain[:, None, None] ** 2] * observations.n_robots
@@ -71,9 +72,9 @@ class RobotEffect(Effect):
 
     def chains(self, theta: Theta, observations: Observations) -> Chains:
         """See `Effect.chains`; each robot is a chain."""
-        slow, day = self._variances(theta)
+        slow, mission = self._variances(theta)
         inverse_gain = theta["inverse_gain"].reshape(len(slow), -1) * np.ones(observations.n_robots)
-        return Chains(1.0 / (day * inverse_gain**2), 1.0 / (slow * inverse_gain**2), self.rho)
+        return Chains(1.0 / (mission * inverse_gain**2), 1.0 / (slow * inverse_gain**2), self.rho)
 
     def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return `robot_effect` (draw, mission, robot), the effects d on stationary trust."""
@@ -101,8 +102,8 @@ class RobotEffect(Effect):
 
     def _covariance(self, theta: Theta, n: int) -> Any:
         """Compute the covariance (point, mission, mission) of one robot's effects d."""
-        slow, day = self._variances(theta)
-        return slow[..., None] * _correlation(self.rho, n) + day[..., None] * np.eye(n)
+        slow, mission = self._variances(theta)
+        return slow[..., None] * _correlation(self.rho, n) + mission[..., None] * np.eye(n)
 
     def _variances(self, theta: Theta) -> list[Any]:
         """Return the variances (point, 1) of the persistent and the mission-specific part."""
