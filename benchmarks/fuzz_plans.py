@@ -3,11 +3,11 @@
     python benchmarks/fuzz_plans.py [-n N] [--first I] [--seed S] [--networkx] [--quick]
 
 The problems vary the grid (holes, closed bounds), the awareness (of cells or bounds), place
-effects, the model (equal, different or coupled robots), the objective, the family, tolls, limits on
-the number of bounds, U-turns, and risks (limits, costs, strata). Numbers are usual, large, tied or
-0. The plan must have the best score of all admissible paths, which `peers.every_path` enumerates
-without code of the planner. With --networkx, the plan must also have the value of
-`planning.reference.plan`. Problem I of a seed is always the same.
+effects, the model (equal, different or coupled robots), the objective, the family, costs of bounds,
+limits on the number of bounds, U-turns, and risks (limits, costs, strata). Numbers are usual,
+large, tied or 0. The plan must have the best score of all admissible paths, which
+`peers.every_path` enumerates without code of the planner. With --networkx, the plan must also have
+the value of `planning.reference.plan`. Problem I of a seed is always the same.
 """
 
 import sys
@@ -147,14 +147,15 @@ def draw_problem(rng):
     ends = [int(np.ravel_multi_index(cell, shape)) for cell in (start, goal)]
     shortest, extra = int(to_goal(into, ends[1])[ends[0]]), int(rng.integers(0, 5))
     turns = rng.random() < 0.4
-    toll = np.where(rng.random() < 0.5, 0.0, rng.exponential(0.1, (8, *shape)))
+    bound_cost = np.where(rng.random() < 0.5, 0.0, rng.exponential(0.1, (8, *shape)))
     p, strata, options = (
         (None, None, {})
         if rng.random() < 0.4
         else draw_risk(rng, (8, *shape), objective == "lost_contact")
     )
     planner = Planner(
-        Workspace.from_awareness(z, passable), start, goal, objective, family=family, toll=toll,
+        Workspace.from_awareness(z, passable), start, goal, objective, family=family,
+        bound_cost=bound_cost,
         max_bounds=shortest + extra if turns else f"shortest+{extra}", **options,
     )  # fmt: skip
     if closed.any():
@@ -166,8 +167,8 @@ def draw_problem(rng):
         risk, failure = risks_of(p, strata, cost)
     limit = -np.log1p(-options["max_failure"]) if "max_failure" in options else np.inf
     return planner, params, World(
-        objective, *ends, into, toll.reshape(8, -1), u, B0, x0, family, sd, shortest + extra, turns,
-        risk, failure, limit,
+        objective, *ends, into, bound_cost.reshape(8, -1), u, B0, x0, family, sd, shortest + extra,
+        turns, risk, failure, limit,
     )  # fmt: skip
 
 

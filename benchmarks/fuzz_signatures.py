@@ -423,7 +423,7 @@ def of_planning() -> list[Call]:
         "goal": (0, 3),
         "objective": "lost_contact",
         "max_bounds": "shortest+4",
-        "toll": np.zeros((8, 4, 4)),
+        "bound_cost": np.zeros((8, 4, 4)),
         "max_failure": 0.5,
         "failure_cost": 1.0,
         "family": "gaussian",

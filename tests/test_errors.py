@@ -106,6 +106,7 @@ RENAMED = {
     "expected_trust": (lambda w: tb.planning.roll_trust(PARAMS, Z), "roll_trust"),
     "next_mission": (lambda w: params_of(None, day=True), "day"),
     "tau_mission": (lambda w: tb.models.RobotEffect(tau_day=0.1), "tau_day"),
+    "bound_cost": (lambda w: Planner(w, *ENDS, toll=0.1), "toll"),
 }
 """Calls with an old name, by the new name, with the old name."""
 HUGE = {

@@ -21,7 +21,7 @@ class World(NamedTuple):
     start: int
     goal: int
     into: np.ndarray  # (move, cell): the cell that the move leads to from a cell, -1 if it may not
-    tolls: np.ndarray  # (move, cell entered), costs apart from trust
+    bound_cost: np.ndarray  # (move, cell entered), costs apart from trust
     u: np.ndarray  # (state, move, cell entered)
     B0: np.ndarray  # (state, state)
     x0: np.ndarray  # (state,)
@@ -47,11 +47,11 @@ class World(NamedTuple):
         # 1 - E[rate]: P(rate = 0) + E[1 - rate; inside], by the symmetry of the normal.
         return ndtr(-b) + (1.0 - trust) * (ndtr(b) - ndtr(a)) + sd * (pdf[0] - pdf[1])
 
-    def score(self, cost, last, toll, risk, n_bounds):
-        """Score of walks: sum of losses, loss of the last bound, tolls, risks (sum, ...)."""
+    def score(self, cost, last, bound_cost, risk, n_bounds):
+        """Score of walks: sum of losses, loss of the last bound, bound costs, risks (sum, ...)."""
         cost = last if self.objective == "terminal" else cost
         scale = n_bounds if self.objective == "mean" else 1.0
-        return -(cost + toll) / scale + np.tensordot(self.failure, np.expm1(-risk), 1)
+        return -(cost + bound_cost) / scale + np.tensordot(self.failure, np.expm1(-risk), 1)
 
 
 class TooManyError(Exception):
@@ -75,7 +75,7 @@ def best_walk(world, most):
     far = to_goal(world.into, world.goal)
     cell, came = np.array([world.start]), np.array([NONE])
     x, risk = world.x0[:, None], np.zeros((len(world.risk), 1))
-    cost, toll, scores, sums, total = np.zeros(1), np.zeros(1), [], [], 0
+    cost, bound_cost, scores, sums, total = np.zeros(1), np.zeros(1), [], [], 0
     for k in range(1, world.longest + 1):
         m, walk = np.nonzero(world.into[:, cell] >= 0)
         other = world.into[m, cell[walk]]
@@ -88,14 +88,14 @@ def best_walk(world, most):
             raise TooManyError
         x = world.B0 @ x[:, walk] + world.u[:, m, other]
         last = world.loss(x.mean(0))
-        cost, toll = cost[walk] + last, toll[walk] + world.tolls[m, other]
+        cost, bound_cost = cost[walk] + last, bound_cost[walk] + world.bound_cost[m, other]
         risk = risk[:, walk] + world.risk[:, m, other]
         cell, came, there = other, m, other == world.goal
-        scores.append(world.score(cost, last, toll, risk, k)[there])
+        scores.append(world.score(cost, last, bound_cost, risk, k)[there])
         sums.append(risk[-1, there])
         on = ~there
         cell, came, x, risk = cell[on], came[on], x[:, on], risk[:, on]
-        cost, toll = cost[on], toll[on]
+        cost, bound_cost = cost[on], bound_cost[on]
     score, limited = np.concatenate(scores), np.concatenate(sums)
     if (np.abs(limited - world.limit) < 1e-9 * max(1.0, world.limit)).any():
         return np.nan, limited.min()
@@ -104,7 +104,7 @@ def best_walk(world, most):
 
 def score_along(world, path):
     """Score of one path; -inf if it is not admissible or beyond the limit."""
-    x, risk, costs, toll, came = world.x0, np.zeros(len(world.risk)), [], 0.0, NONE
+    x, risk, costs, bound_cost, came = world.x0, np.zeros(len(world.risk)), [], 0.0, NONE
     if path[0] != world.start or path[-1] != world.goal or world.goal in path[:-1]:
         return -np.inf
     for a, c in pairwise(path):
@@ -114,7 +114,7 @@ def score_along(world, path):
         came = entering[0]
         x = world.B0 @ x + world.u[:, came, c]
         costs.append(world.loss(x.mean()))
-        risk, toll = risk + world.risk[:, came, c], toll + world.tolls[came, c]
+        risk, bound_cost = risk + world.risk[:, came, c], bound_cost + world.bound_cost[came, c]
     if len(costs) > world.longest or risk[-1] > world.limit:
         return -np.inf
-    return world.score(sum(costs), costs[-1], toll, risk, len(costs))
+    return world.score(sum(costs), costs[-1], bound_cost, risk, len(costs))

@@ -1,4 +1,4 @@
-"""The planner that a user holds: plans, tolls, graph of bounds, draws and rests of missions."""
+"""The planner that a user holds: plans, costs and graph of bounds, draws and rests of missions."""
 
 import networkx as nx
 import numpy as np
@@ -88,20 +88,20 @@ def test_plan_of_a_posterior_reads_it_once_and_is_that_of_its_mean_and_draws(
     np.testing.assert_array_equal(plan.bands, expected.bands)
 
 
-def test_a_toll_is_taken_from_the_value_of_its_bounds(workspace):
+def test_the_cost_of_a_bound_is_taken_from_the_value(workspace):
     metres = 20.0 * np.hypot(*STEPS.T)[:, None, None]
-    plan = Planner(workspace, *ENDS, toll=0.001 * metres).plan(PARAMS)
+    plan = Planner(workspace, *ENDS, bound_cost=0.001 * metres).plan(PARAMS)
     free = Planner(workspace, *ENDS).evaluate(plan.path, PARAMS)
     assert plan.value == pytest.approx(free.value - 0.001 * plan.length, rel=1e-12)
-    for toll in (np.zeros((3, 5, 6)), np.nan):
-        with pytest.raises(TrustboError, match="toll"):
-            Planner(workspace, *ENDS, toll=toll)
+    for bound_cost in (np.zeros((3, 5, 6)), np.nan):
+        with pytest.raises(TrustboError, match="bound_cost"):
+            Planner(workspace, *ENDS, bound_cost=bound_cost)
 
 
 def test_the_graph_of_bounds_is_for_any_algorithm_of_networkx(workspace):
     """Without memory of trust, losses of bounds add up to those of the plan."""
     p_fail = np.random.default_rng(1).uniform(0.0, 0.2, (8, 5, 6))
-    planner = Planner(workspace, *ENDS, toll=0.01, failure_cost=0.0, max_bounds=8)
+    planner = Planner(workspace, *ENDS, bound_cost=0.01, failure_cost=0.0, max_bounds=8)
     planner = planner.with_risk(p_fail)
     forgetful = PARAMS._replace(beta0=0.0)
     graph, plan = planner.graph(forgetful), planner.plan(forgetful)
@@ -136,7 +136,7 @@ def test_regret_and_shares_of_cells_are_what_enumeration_says(workspace, draws):
 
 
 def test_regret_of_contact_is_a_share_of_what_the_best_path_keeps(workspace, draws):
-    planner = Planner(workspace, *ENDS, toll=0.01)
+    planner = Planner(workspace, *ENDS, bound_cost=0.01)
     path = planner.plan(draws.mean()).path
     relative = planner.plan_draws(draws).relative_regret(path)
     for d in range(20):
@@ -202,7 +202,7 @@ def test_walks_that_need_too_large_a_graph_are_refused():
         )
 
 
-def test_tolls_risks_and_starts_are_read_by_name(workspace):
+def test_costs_risks_and_starts_are_read_by_name(workspace):
     rng = np.random.default_rng(1)
     values = rng.uniform(size=(8, 5, 6))
     coords = {"move": list(MOVE_NAMES), "row": range(5), "col": range(6)}
@@ -210,8 +210,8 @@ def test_tolls_risks_and_starts_are_read_by_name(workspace):
     turned = labelled.transpose().isel(move=slice(None, None, -1), row=[4, 0, 1, 2, 3])
     x0 = {"r3": 0.9, "r1": 0.1, "r2": 0.5}
 
-    right = Planner(workspace, *ENDS, toll=values).with_risk(0.1 * values, 0.1 * values[None])
-    found = Planner(workspace, *ENDS, toll=turned).with_risk(
+    right = Planner(workspace, *ENDS, bound_cost=values).with_risk(0.1 * values, 0.1 * values[None])
+    found = Planner(workspace, *ENDS, bound_cost=turned).with_risk(
         0.1 * turned, 0.1 * turned.expand_dims("draw", -1)
     )
     plan, expected = found.plan(PARAMS, x0=x0), right.plan(PARAMS, x0=[0.1, 0.5, 0.9])
@@ -219,19 +219,20 @@ def test_tolls_risks_and_starts_are_read_by_name(workspace):
         expected.path, expected.value, expected.p_arrive
     )  # fmt: skip
 
-    of_cells = Planner(workspace, *ENDS, toll=turned.isel(move=0, drop=True))
+    of_cells = Planner(workspace, *ENDS, bound_cost=turned.isel(move=0, drop=True))
     np.testing.assert_array_equal(
-        of_cells.problem.toll, Planner(workspace, *ENDS, toll=values[7]).problem.toll
+        of_cells.problem.bound_cost,
+        Planner(workspace, *ENDS, bound_cost=values[7]).problem.bound_cost,
     )
-    of_moves = Planner(workspace, *ENDS, toll=dict(zip(MOVE_NAMES, range(8), strict=True)))
-    by_place = Planner(workspace, *ENDS, toll=np.arange(8.0)[:, None, None])
-    np.testing.assert_array_equal(of_moves.problem.toll, by_place.problem.toll)
+    of_moves = Planner(workspace, *ENDS, bound_cost=dict(zip(MOVE_NAMES, range(8), strict=True)))
+    by_place = Planner(workspace, *ENDS, bound_cost=np.arange(8.0)[:, None, None])
+    np.testing.assert_array_equal(of_moves.problem.bound_cost, by_place.problem.bound_cost)
 
 
 def test_options_that_are_no_maps_are_refused(workspace):
-    for toll in ("a", {"up": 1.0}, xr.DataArray(np.zeros((5, 6)), dims=("y", "x"))):
-        with pytest.raises(TrustboError, match="toll"):
-            Planner(workspace, *ENDS, toll=toll)
+    for bound_cost in ("a", {"up": 1.0}, xr.DataArray(np.zeros((5, 6)), dims=("y", "x"))):
+        with pytest.raises(TrustboError, match="bound_cost"):
+            Planner(workspace, *ENDS, bound_cost=bound_cost)
     planner = Planner(workspace, *ENDS)
     for p_fail in ("a", xr.DataArray(np.zeros((5, 6)), dims=("row", "col"))):
         with pytest.raises(TrustboError, match="p_fail"):

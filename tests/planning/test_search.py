@@ -76,20 +76,20 @@ def test_a_new_objective_is_a_row(workspace, monkeypatch):
     """Trust discounted by the bounds that are left, by its definition on every path."""
     row = Objective("late", credit=lambda left: 0.7**left, scale=lambda n_bounds: n_bounds + 1.0)
     monkeypatch.setitem(OBJECTIVES, "late", row)
-    toll = np.random.default_rng(1).uniform(0.0, 0.2, (8, 4, 4))
-    planner = Planner(workspace, *ENDS, "late", toll=toll)
+    bound_cost = np.random.default_rng(1).uniform(0.0, 0.2, (8, 4, 4))
+    planner = Planner(workspace, *ENDS, "late", bound_cost=bound_cost)
     values = []
     for path in reference.every_path(planner.problem.paths):
         plan = planner.evaluate(path, PARAMS)
         trust = plan.trust.mean(1)
         n = len(trust)
-        paid = planner.problem.toll_along(path)
+        paid = planner.problem.bound_cost_along(path)
         values.append(
             (sum(0.7 ** (n - k) * trust[k - 1] for k in range(1, n + 1)) - paid) / (n + 1)
         )
         assert plan.value == pytest.approx(values[-1], rel=1e-12)
     assert planner.plan(PARAMS).value == pytest.approx(max(values), rel=1e-12)
-    limited = Planner(workspace, *ENDS, "late", toll=toll, max_failure=0.99)
+    limited = Planner(workspace, *ENDS, "late", bound_cost=bound_cost, max_failure=0.99)
     limited = limited.with_risk(np.full((8, 4, 4), 0.01))
     assert limited.plan(PARAMS).value == pytest.approx(max(values), rel=1e-12)
 

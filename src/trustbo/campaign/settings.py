@@ -79,8 +79,9 @@ def to_settings(
     Raises:
         TrustboError: The seed is not a whole number, or an option cannot be stored in a file.
     """
-    if "toll" in planner:
-        planner = planner | {"toll": base.problem.toll}  # in the order of the moves, rows, columns
+    if "bound_cost" in planner:
+        # In the order of the moves, rows and columns.
+        planner = planner | {"bound_cost": base.problem.bound_cost}
 
     settings = {
         "start": base.start,

@@ -67,7 +67,7 @@ class DrawnPaths:
         """
         scale = np.abs(self.values)
         if self.problem.objective.of_contact:
-            most = [len(path) - 1 + self.problem.toll_along(path) for path in self.candidates]
+            most = [len(path) - 1 + self.problem.bound_cost_along(path) for path in self.candidates]
             scale = np.maximum(0.0, np.array(most)[self._distinct[1]] + self.values)
 
         regret = self.regret(path)

@@ -49,7 +49,7 @@ _NO_CELL_YET = -2  # differs from all cells and from -1, the cell before the sta
 class Costs(NamedTuple):
     """Costs of paths for one draw.
 
-    `loss` is a value of `LOSSES`. A bound costs its loss plus its `toll` (bound,) minus `weight`
+    `loss` is a value of `LOSSES`. A bound costs its loss plus `bound_cost` (bound,) minus `weight`
     (left, robot) times `drift` (robot, bound). `start` (left,) is the constant cost of paths with a
     given number of bounds. `transition` (robot, robot) and `x0` (robot,) define the recursion for
     trust, or are empty if there is no loss. `sd` is the sd of a rate. `risk` has the shape (bound,
@@ -63,7 +63,7 @@ class Costs(NamedTuple):
     transition: np.ndarray
     x0: np.ndarray
     sd: float | np.ndarray
-    toll: np.ndarray
+    bound_cost: np.ndarray
     risk: np.ndarray
     failure: np.ndarray
     limit: float
@@ -110,10 +110,10 @@ def best_labels(
 @kernel
 def _best_labels(graph, costs, max_labels, cost, lower, paths, begin, end):
     """Write the results of `_best_path` for the draws from `begin` to `end`."""
-    loss, drift, weight, start, transition, x0, sd, toll, risk, failure, limit = costs
+    loss, drift, weight, start, transition, x0, sd, bound_cost, risk, failure, limit = costs
     for d in range(begin, end):
         trust = transition[d], x0[d], sd[d]
-        one = Costs(loss, drift[d], weight[d], start[d], *trust, toll, risk, failure, limit)
+        one = Costs(loss, drift[d], weight[d], start[d], *trust, bound_cost, risk, failure, limit)
         cost[d], lower[d] = _best_path(graph, one, max_labels, paths[d])
 
 
@@ -373,7 +373,7 @@ def _best_path(graph, costs, max_labels, path):
     n = len(path)
     n_sums = len(costs.failure)
     edge_cost = np.empty(len(graph.head))
-    costs_of_sums(graph, costs.drift, costs.weight, costs.toll, edge_cost)
+    costs_of_sums(graph, costs.drift, costs.weight, costs.bound_cost, edge_cost)
 
     known = Known(np.full(1, np.inf), np.full(n, -1), np.full(n, -1), np.zeros(n_sums))
     least_cost = _least_costs(graph, costs, edge_cost)

@@ -21,14 +21,14 @@ def _same(score: Array) -> Array:
 
 
 class Objective(NamedTuple):
-    """Definition of a path's value in terms of the trust along the path and its tolls.
+    """Definition of a path's value from the trust along the path and the costs of its bounds.
 
     The score of a path of K bounds, with trust x_k after bound k, is
 
-        (sum_k credit(K - k) x_k - tolls) / scale(K),
+        (sum_k credit(K - k) x_k - bound costs) / scale(K),
 
-    or, if `of_contact` is True, minus the sum of the expected lost contact and the tolls. To add an
-    objective, add an entry to `OBJECTIVES`; the searches need no change.
+    or, if `of_contact` is True, minus the sum of the expected lost contact and bound costs. To add
+    an objective, add an entry to `OBJECTIVES`; the searches need no change.
     """
 
     name: str
@@ -50,10 +50,11 @@ MEAN = Objective("mean", scale=lambda n_bounds: np.maximum(n_bounds, 1.0))
 OBJECTIVES: dict[str, Objective] = {row.name: row for row in (LOST_CONTACT, TERMINAL, MEAN)}
 """Objectives, keyed by name; larger values are better.
 
-lost_contact: minus the sum of the expected lost contact in bounds, the tolls and, if the planner
-has a risk, `failure_cost` times the failure probability. With an expected contact rate of 0.9, a
-path of 9 bounds loses 0.9 bounds. terminal: sigma(trust at the goal - tolls); without tolls, the
-value is one minus the cost (6) of the paper. mean: the mean over bounds of trust minus toll.
+lost_contact: minus the sum of the expected lost contact in bounds, the bound costs and, if the
+planner has a risk, `failure_cost` times the failure probability. With an expected contact rate of
+0.9, a path of 9 bounds loses 0.9 bounds. terminal: sigma(trust at the goal - bound costs); without
+bound costs, the value is one minus the cost (6) of the paper. mean: the mean over bounds of trust
+minus bound costs.
 """
 
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_choice, require_positive
+from trustbo.errors import Renamed, TrustboError, require_choice, require_positive
 from trustbo.hazard.risk import Risk
 from trustbo.hazard.strata import Strata
 from trustbo.models.families import FAMILIES
@@ -54,6 +54,7 @@ class Planner(Summary):
         >>> planner.plan(posterior).path
     """
 
+    @Renamed(toll="bound_cost")
     def __init__(
         self,
         workspace: Workspace,
@@ -62,7 +63,7 @@ class Planner(Summary):
         objective: str = "lost_contact",
         *,
         max_bounds: int | str | None = None,
-        toll: ArrayLike = 0.0,
+        bound_cost: ArrayLike = 0.0,
         max_failure: float | None = None,
         failure_cost: float | None = None,
         family: str = "gaussian",
@@ -78,10 +79,10 @@ class Planner(Summary):
                 fewest bounds. `"shortest+n"` allows up to n more bounds, but no U-turns. An int
                 allows any walk of up to that many bounds. The default is n = 4 for lost_contact
                 and n = 2 for the others. If n > 2, paths may revisit cells (see `Plan.revisits`).
-            toll: Additional cost of each bound, such as its length or duration. The array must
-                broadcast to (move, row, col), with the moves of `workspace.MOVES`; a
-                DataArray is aligned by its dims and labels. Tolls are in bounds for lost_contact,
-                and in units of trust for the other objectives.
+            bound_cost: Additional cost of each bound (edge cost), such as its length or duration.
+                The array must broadcast to (move, row, col), with the moves of `workspace.MOVES`; a
+                DataArray is aligned by its dims and labels. The costs are in bounds for
+                lost_contact, and in units of trust for the other objectives.
             max_failure: Largest failure probability of a path, in [0, 1); by default, no limit.
             failure_cost: Cost of a failure in bounds, for lost_contact. The value is reduced by
                 this cost times the failure probability. The default is the smallest number of
@@ -90,8 +91,8 @@ class Planner(Summary):
 
         Raises:
             TrustboError: If the start or goal is off the grid or impassable, the start equals the
-                goal, `max_bounds` is too small, the toll has the wrong shape, a name is unknown, or
-                a number is out of range.
+                goal, `max_bounds` is too small, `bound_cost` has the wrong shape, a name is
+                unknown, or a number is out of range.
             NoPathError: If the goal cannot be reached from the start.
         """
         aim = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
@@ -100,8 +101,8 @@ class Planner(Summary):
             max_bounds = aim.max_bounds
 
         paths = AdmissiblePaths(workspace, start, goal, max_bounds)
-        tolls = _toll_of(toll, paths.bounds)
-        self.problem = Problem(paths, aim, rates, tolls, max_failure, failure_cost)
+        bound_cost = _bound_cost_of(bound_cost, paths.bounds)
+        self.problem = Problem(paths, aim, rates, bound_cost, max_failure, failure_cost)
 
     def _rows(self) -> Rows:
         problem = self.problem
@@ -318,9 +319,9 @@ class Planner(Summary):
         Nodes are the passable cells `(row, col)`, with the CRS coordinates `x` and `y` of their
         centres in metres. Edges are the bounds, with their `length` in metres, the `drift` of the
         team's mean trust and, given a risk, `risk` = -log(1 - p_fail). Let x be the limit of trust
-        if a bound is repeated. Then `cost` is -log sigma(x) plus the toll, and `lost` is the
-        contact lost at trust x, in bounds, plus the toll. If beta0 is 0, minus the sum of `lost`
-        along a path is the value of the path for lost_contact, without failures.
+        if a bound is repeated. Then `cost` is -log sigma(x) plus the bound cost, and `lost` is the
+        contact lost at trust x, in bounds, plus the bound cost. If beta0 is 0, minus the sum of
+        `lost` along a path is the value of the path for lost_contact, without failures.
 
         Args:
             params: Posterior from `fit`, or parameters. Several draws are replaced by their mean.
@@ -345,14 +346,14 @@ class Planner(Summary):
         def of_bounds(values: np.ndarray) -> np.ndarray:
             return np.broadcast_to(values, bounds.shape)[bounds]
 
-        toll = of_bounds(problem.toll)
+        bound_cost = of_bounds(problem.bound_cost)
         settled = of_bounds(recursion.steady_state())
         rate = problem.family.mean_rate(of_bounds(contact.steady_state()), recursion.noise_sd)
         values = {
             "length": of_bounds(length[:, None, None]),
             "drift": of_bounds(recursion.drift.mean(0)),
-            "cost": toll + np.logaddexp(0.0, -settled),
-            "lost": toll + 1.0 - rate,
+            "cost": bound_cost + np.logaddexp(0.0, -settled),
+            "lost": bound_cost + 1.0 - rate,
         }
         if problem.risk is not None:
             values["risk"] = of_bounds(risk_of(problem.risk.p_fail))
@@ -374,9 +375,10 @@ class Planner(Summary):
 
         The maximum is over paths to the cell, without U-turns, that have at most two bounds more
         than the fewest, or fewer if `max_bounds` is tighter. Longer walks are excluded because they
-        could gain trust by loitering. With the default `max_bounds` and no toll, the value at the
-        goal equals the final trust of the `terminal` plan. The map has the shape (row, col), or
-        (robot, row, col) with `per_robot`, and a leading axis (draw,) if there are several draws.
+        could gain trust by loitering. With the default `max_bounds` and no bound costs, the value
+        at the goal equals the final trust of the `terminal` plan. The map has the shape (row, col),
+        or (robot, row, col) with `per_robot`, and a leading axis (draw,) if there are several
+        draws.
 
         Args:
             params: Posterior from `fit`, or parameters of any model.
@@ -443,27 +445,28 @@ class Planner(Summary):
         return self.workspace.grid.place(dataset.where(passable))
 
 
-def _toll_of(toll: ArrayLike, bounds: np.ndarray) -> np.ndarray:
-    """Return the toll of each bound, shape (move, row, col); 0 where there is no bound.
+def _bound_cost_of(bound_cost: ArrayLike, bounds: np.ndarray) -> np.ndarray:
+    """Return the cost of each bound, shape (move, row, col); 0 where there is no bound.
 
-    Raises TrustboError if the shape does not broadcast or the toll of a bound is not finite.
+    Raises TrustboError if the shape does not broadcast or the cost of a bound is not finite.
     """
-    given = read_labelled("toll", toll, _DIMS, _MOVE_LABELS, partial=True).values
+    given = read_labelled("bound_cost", bound_cost, _DIMS, _MOVE_LABELS, partial=True).values
     try:
-        tolls = np.where(bounds, np.broadcast_to(given, bounds.shape), 0.0)
+        bound_cost = np.where(bounds, np.broadcast_to(given, bounds.shape), 0.0)
     except ValueError:
         raise TrustboError(
-            f"toll must broadcast to (move, row, col) = {bounds.shape}; got shape {given.shape}."
+            f"bound_cost must broadcast to (move, row, col) = {bounds.shape}; got shape "
+            f"{given.shape}."
         ) from None
 
-    if not np.isfinite(tolls).all():
-        move, row, col = np.argwhere(~np.isfinite(tolls))[0].tolist()
+    if not np.isfinite(bound_cost).all():
+        move, row, col = np.argwhere(~np.isfinite(bound_cost))[0].tolist()
         raise TrustboError(
-            f"toll[{move}, {row}, {col}] = {tolls[move, row, col]} is not finite; give a finite "
-            "toll for every bound."
+            f"bound_cost[{move}, {row}, {col}] = {bound_cost[move, row, col]} is not finite; give "
+            "a finite cost for every bound."
         )
 
-    return tolls
+    return bound_cost
 
 
 def _value_along(
@@ -490,4 +493,4 @@ def _value_along(
     # However, the contact lost on a path cannot be negative.
     team = capped(problem.objective, problem.family, trust_recursion(of_path, z, x0))
     mean = problem.value_along(cells, states_along(team).mean(-1), team.noise_sd).mean()
-    return trust, float(mean), np.minimum(values, -problem.toll_along(cells))
+    return trust, float(mean), np.minimum(values, -problem.bound_cost_along(cells))

@@ -51,7 +51,7 @@ class Problem:
         paths: Admissible paths.
         objective: One of the objectives in `OBJECTIVES`.
         family: Observation family of the contact rates.
-        toll: Additional cost of each bound, shape (move, row, col).
+        bound_cost: Additional cost of each bound, shape (move, row, col).
         max_failure: Largest failure probability allowed for a path, or None for no limit.
         failure_cost: Cost of a failure in bounds; None for the smallest number of bounds of a path.
         risk: Failure probability of each bound, or None if the planner has no risk.
@@ -60,7 +60,7 @@ class Problem:
     paths: AdmissiblePaths
     objective: Objective
     family: Family
-    toll: np.ndarray
+    bound_cost: np.ndarray
     max_failure: float | None = None
     failure_cost: float | None = None
     risk: Risk | None = None
@@ -92,9 +92,9 @@ class Problem:
             return float(self.paths.shortest)
         return self.failure_cost
 
-    def toll_along(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Sum the tolls along a path."""
-        return float(self.toll[*bounds_along(path).T].sum())
+    def bound_cost_along(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """Sum the costs of the bounds of a path."""
+        return float(self.bound_cost[*bounds_along(path).T].sum())
 
     def value_along(
         self, path: Sequence[Cell] | np.ndarray, trust: np.ndarray, noise_sd: np.ndarray
@@ -104,15 +104,15 @@ class Problem:
         The team's `trust` after each bound has shape (..., bound), and `noise_sd` has shape (...,).
         """
         objective = self.objective
-        toll = self.toll_along(path)
+        bound_cost = self.bound_cost_along(path)
         if objective.of_contact:
             lost = 1.0 - self.family.mean_rate(trust, noise_sd[..., None])
-            return objective.value(-lost.sum(-1) - toll)
+            return objective.value(-lost.sum(-1) - bound_cost)
 
         n_bounds = trust.shape[-1]
         credit = objective.credit(np.arange(n_bounds))[::-1]
         scale = objective.scale(np.array([float(n_bounds)]))[0]
-        return objective.value((trust @ credit - toll) / scale)
+        return objective.value((trust @ credit - bound_cost) / scale)
 
     def failure_along(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Compute the expected cost of failure: `price` times the failure probability of a path."""
@@ -204,12 +204,12 @@ class Problem:
         graph = self.paths.graph
         n_draws, n_states = recursion.start.shape
         drift = recursion.drift.reshape(n_draws, n_states, -1)
-        toll = self.toll.ravel()
+        bound_cost = self.bound_cost.ravel()
         view = np.full(n_states, 1.0 / n_states)
         weights = weights_of(self.objective, recursion, view, graph.longest)
 
         if self.risks is None and not history:
-            score, paths = best_sums(graph, drift, weights, toll)
+            score, paths = best_sums(graph, drift, weights, bound_cost)
             return score, score, paths
 
         n_trust = 0
@@ -219,7 +219,7 @@ class Problem:
             loss = LOSSES[self.family.expected_rate]
             weights = Weights(0.0 * weights.per_bound, 0.0 * weights.constant, weights.scale)
 
-        risks = self.risks or Risks(np.zeros((len(toll), 1)), np.zeros(1), np.inf)
+        risks = self.risks or Risks(np.zeros((len(bound_cost), 1)), np.zeros(1), np.inf)
         costs = Costs(
             loss=loss,
             drift=drift,
@@ -228,7 +228,7 @@ class Problem:
             transition=recursion.transition[:, :n_trust, :n_trust].copy(),
             x0=recursion.start[:, :n_trust].copy(),
             sd=np.maximum(recursion.noise_sd, TINY_SD),
-            toll=toll,
+            bound_cost=bound_cost,
             risk=risks.of_bounds,
             failure=risks.failure,
             limit=risks.limit,
@@ -257,7 +257,7 @@ class Problem:
         n = graph.longest + 1
         nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
 
-        # The safest path is the cheapest one if the toll of each bound is its risk -log(1 - p).
+        # The safest path is the cheapest one if the cost of each bound is its risk -log(1 - p).
         of_bounds = risk_of(risk.p_fail).ravel()
         _, paths = best_sums(graph, np.zeros((1, 1, len(of_bounds))), nothing, of_bounds)
         path = self.paths.cells(paths[0])

@@ -52,7 +52,7 @@ def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
 def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cell, ...]]:
     """Find the best path for each number of bounds with `networkx.bellman_ford_path`.
 
-    A bound with drift u and j bounds left after it adds w_j . u minus its toll to the value. Here,
+    A bound with drift u and j bounds left after it adds w_j . u minus its cost to the value. Here,
     w_j = sum_{i <= j} credit(i) view . B0^(j - i), and view . x is the team's mean trust.
     """
     problem = planner.problem
@@ -68,9 +68,11 @@ def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cel
         weights.append(carried)
 
     drift = recursion.drift.reshape(n_states, -1)
-    toll = problem.toll.ravel()
+    bound_cost = problem.bound_cost.ravel()
     left = graph.left[graph.head]  # bounds left after each edge
-    cost = [toll[b] - weights[j] @ drift[:, b] for b, j in zip(graph.bound, left, strict=True)]
+    cost = [
+        bound_cost[b] - weights[j] @ drift[:, b] for b, j in zip(graph.bound, left, strict=True)
+    ]
     network = graph.to_networkx(cost)
 
     for s in graph.starts:

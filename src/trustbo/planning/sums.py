@@ -13,15 +13,15 @@ from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, 
 
 
 def best_sums(
-    graph: Unrolled, drift: np.ndarray, weights: Weights, toll: np.ndarray
+    graph: Unrolled, drift: np.ndarray, weights: Weights, bound_cost: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the path with the largest (constant + sum of w_j . u - tolls) / scale for each draw.
+    """Find the path with the largest (constant + sum of w_j . u - costs) / scale for each draw.
 
     Args:
         graph: Unrolled graph.
         drift: Drift of each state of trust, shape (draw, state, bound).
         weights: Weights of the drift.
-        toll: Additional cost of each bound, shape (bound,).
+        bound_cost: Additional cost of each bound, shape (bound,).
 
     Returns:
         Scores (draw,) and paths (draw, cell) as flat cell indices, padded with -1.
@@ -31,21 +31,21 @@ def best_sums(
     paths = np.full((n, graph.longest + 1), -1, np.int32)
 
     def work(begin: int, end: int) -> None:
-        _best_sums(graph, drift, *weights, toll, scores, paths, begin, end)
+        _best_sums(graph, drift, *weights, bound_cost, scores, paths, begin, end)
 
     over_rows(work, n)
     return scores, paths
 
 
 @kernel
-def _best_sums(graph, drift, per_bound, constant, scale, toll, scores, paths, begin, end):
+def _best_sums(graph, drift, per_bound, constant, scale, bound_cost, scores, paths, begin, end):
     """Write the best score and path of the draws from `begin` to `end`."""
     cost = np.empty(len(graph.head))
     to_go = new_to_go(len(graph.cell))
     edges = np.empty(paths.shape[1], np.int64)
 
     for d in range(begin, end):
-        costs_of_sums(graph, drift[d], per_bound[d], toll, cost)
+        costs_of_sums(graph, drift[d], per_bound[d], bound_cost, cost)
         fill_to_go(graph, cost, to_go)
 
         chosen = -1
@@ -63,11 +63,11 @@ def _best_sums(graph, drift, per_bound, constant, scale, toll, scores, paths, be
 
 
 @kernel
-def costs_of_sums(graph, drift, per_bound, toll, cost) -> None:
-    """Write the cost of each edge for one draw, which is the toll minus w_j . u, to `cost`."""
+def costs_of_sums(graph, drift, per_bound, bound_cost, cost) -> None:
+    """Write the cost of each edge for one draw to `cost`: that of its bound minus w_j . u."""
     for e in range(len(graph.head)):
         left = graph.left[graph.head[e]]
         b = graph.bound[e]
-        cost[e] = toll[b]
+        cost[e] = bound_cost[b]
         for i in range(len(drift)):
             cost[e] -= per_bound[left, i] * drift[i, b]

@@ -56,11 +56,11 @@ def _largest(paths: AdmissiblePaths, recursion: Recursion, view: np.ndarray) -> 
     # Otherwise, one search for each cell.
     drift = recursion.drift.reshape(*recursion.start.shape, -1)
     values = np.full((len(drift), *paths.bounds.shape[1:]), np.nan)
-    no_toll = np.zeros(paths.bounds.size)
+    no_cost = np.zeros(paths.bounds.size)
     for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
         graph = paths.to((row, col), extra).graph
         weights = weights_of(TERMINAL, recursion, view, graph.longest)
-        values[:, row, col], _ = best_sums(graph, drift, weights, no_toll)
+        values[:, row, col], _ = best_sums(graph, drift, weights, no_cost)
 
     values[:, *paths.start] = recursion.start @ view
     return values
