@@ -318,7 +318,7 @@ def of_data() -> list[Call]:
 
 
 def of_models() -> list[Call]:
-    usual = {"priors": tb.models.Priors(), "observation": "gaussian", "effects": ()}
+    usual = {"priors": tb.models.Priors(), "family": "gaussian", "effects": ()}
     more = usual | {"memory": "level", "shared_noise": False}
     human = {"scale": "unit", "tau_start": 0.3, "tau_level": 0.2, "tau_gain": 0.2}
     place = {"tau_s": 0.2, "tau_e": 0.2, "length_scale": 2.0, "length_scale_sd": 0.5}
@@ -332,7 +332,7 @@ def of_models() -> list[Call]:
     }
     robot = {"tau_slow": 0.2, "tau_mission": 0.2, "rho": 0.9}
     numbers = {"concentration": 2.0, "x0_mean": 0.5, "x0_sd": 0.5, "stationary": False}
-    of_names = {"features": ("a", "b"), "observation": "gaussian"}
+    of_names = {"features": ("a", "b"), "family": "gaussian"}
     return [
         Call("models.PooledTrust", tb.models.PooledTrust, more),
         Call("models.HierarchicalTrust", tb.models.HierarchicalTrust, more),
@@ -372,7 +372,7 @@ def of_inference() -> list[Call]:
     filtering = {
         "posterior": posterior(),
         "n_robots": 3,
-        "observation": "gaussian",
+        "family": "gaussian",
         "max_draws": 50,
     }
     update = {

@@ -45,7 +45,7 @@ EFFECTS = (PlaceEffect(), RobotEffect())
 
 DEFAULT = PooledTrust(effects=EFFECTS)
 SHARED = PooledTrust(effects=EFFECTS, shared_noise=True)
-CENSORED = PooledTrust(effects=EFFECTS, observation="censored")
+CENSORED = PooledTrust(effects=EFFECTS, family="censored")
 
 FITS = {
     "default model, 3 missions": (3, DEFAULT),

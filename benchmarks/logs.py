@@ -19,9 +19,9 @@ from trustbo.models import PooledTrust, RobotEffect
 
 MODELS = {
     "Gaussian": PooledTrust(),
-    "censored": PooledTrust(observation="censored"),
-    "counts": PooledTrust(observation="beta_binomial"),
-    "counts, robots": PooledTrust(effects=RobotEffect(), observation="beta_binomial"),
+    "censored": PooledTrust(family="censored"),
+    "counts": PooledTrust(family="beta_binomial"),
+    "counts, robots": PooledTrust(effects=RobotEffect(), family="beta_binomial"),
 }
 
 

@@ -48,9 +48,9 @@ ROWS = {
     "hierarchical, robots": HierarchicalTrust(effects=(RobotEffect(),)),
     "coupled": CoupledTrust(),
     "coupled, robots": CoupledTrust(effects=(RobotEffect(),)),
-    "censored, robots": PooledTrust(observation="censored", effects=(RobotEffect(),)),
-    "censored, places": PooledTrust(observation="censored", effects=(PlaceEffect(),)),
-    "counts": PooledTrust(observation="beta_binomial"),
+    "censored, robots": PooledTrust(family="censored", effects=(RobotEffect(),)),
+    "censored, places": PooledTrust(family="censored", effects=(PlaceEffect(),)),
+    "counts": PooledTrust(family="beta_binomial"),
     "likert7": HumanTrust(scale="likert7"),
 }
 

@@ -39,12 +39,10 @@ EXACT = {
 }
 NUTS = {
     "pooled nuts": {"sampler": "nuts"},
-    "pooled censored": {"model": ("PooledTrust", {"observation": "censored"})},
-    "pooled beta_binomial": {"model": ("PooledTrust", {"observation": "beta_binomial"})},
+    "pooled censored": {"model": ("PooledTrust", {"family": "censored"})},
+    "pooled beta_binomial": {"model": ("PooledTrust", {"family": "beta_binomial"})},
     "hierarchical": {"model": ("HierarchicalTrust", {})},
-    "hierarchical beta_binomial": {
-        "model": ("HierarchicalTrust", {"observation": "beta_binomial"})
-    },
+    "hierarchical beta_binomial": {"model": ("HierarchicalTrust", {"family": "beta_binomial"})},
     "coupled full": {"model": ("CoupledTrust", {})},
 }
 

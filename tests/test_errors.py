@@ -12,7 +12,7 @@ import trustbo as tb
 from trustbo import errors
 from trustbo.inference import TrustFilter, fit, params_of
 from trustbo.inference.diagnostics import diagnostics
-from trustbo.models import PooledTrust, Priors
+from trustbo.models import CoupledTrust, HierarchicalTrust, HumanTrust, PooledTrust, Priors
 from trustbo.planning import Planner
 from trustbo.planning.policies import optimistic
 from trustbo.simulation import KinematicSimulator, ModelSimulator, ReplaySimulator, Truth
@@ -77,7 +77,7 @@ MISTAKES = {
     "extinction below 0": (lambda w: tb.workspace.Sight(extinction=-0.1), "extinction"),
     "one number for a mean and an sd": (lambda w: tb.hazard.Hazard(margin=0.5), "margin"),
     "no effects": (lambda w: PooledTrust(effects=None), "effects"),
-    "an unknown family": (lambda w: Priors.of(("a",), observation="x"), "observation"),
+    "an unknown family": (lambda w: Priors.of(("a",), family="x"), "family"),
     "a model as text": (lambda w: tb.inference.sample_prior("x", 2, 5, 0), "model"),
     "a quantile as text": (
         lambda w: optimistic(RNG, PARAMS, Planner(w, *ENDS), quantile="9"),
@@ -107,6 +107,7 @@ RENAMED = {
     "next_mission": (lambda w: params_of(None, day=True), "day"),
     "tau_mission": (lambda w: tb.models.RobotEffect(tau_day=0.1), "tau_day"),
     "bound_cost": (lambda w: Planner(w, *ENDS, toll=0.1), "toll"),
+    "family": (lambda w: PooledTrust(observation="censored"), "observation"),
 }
 """Calls with an old name, by the new name, with the old name."""
 HUGE = {
@@ -143,6 +144,21 @@ def test_an_old_name_is_answered_with_the_new_one(new, workspace):
     call, old = RENAMED[new]
     with pytest.raises(tb.TrustboError, match=rf"{old}'? is now called '{new}'"):
         call(workspace)
+
+
+def test_old_attributes_are_answered_and_no_others():
+    model = HierarchicalTrust(family="censored")
+    with pytest.raises(tb.TrustboError, match="'family'"):
+        model.observation  # noqa: B018
+    assert not hasattr(model, "observation")
+    with pytest.raises(AttributeError, match="families"):
+        model.families  # noqa: B018
+
+
+@pytest.mark.parametrize("kind", [PooledTrust, HierarchicalTrust, CoupledTrust, HumanTrust])
+def test_every_model_answers_the_old_name_of_its_family(kind):
+    with pytest.raises(tb.TrustboError, match="'family'"):
+        kind(observation="censored")
 
 
 def test_other_names_are_refused_as_python_does():

@@ -82,7 +82,7 @@ def _facts(result: Result) -> dict[str, str]:
     plan = result.plan
     problem = result.planner.problem
     noise_sd = problem.recursion(result.belief.mean()).noise_sd
-    contact = np.minimum(problem.family.mean_rate(plan.trust, noise_sd), 1.0).mean(1)
+    contact = np.minimum(problem.likelihood.mean_rate(plan.trust, noise_sd), 1.0).mean(1)
     worst = int(np.argmin(contact))
 
     rate = result.state.entries[-1].row["contact_rate"]
@@ -127,7 +127,7 @@ def _path(plan: Plan) -> _Section:
 
 
 def _trust(result: Result) -> _Section:
-    is_logit = result.settings["observation"] == "beta_binomial"
+    is_logit = result.settings["family"] == "beta_binomial"
     scale = "Trust is the logit of contact." if is_logit else "A trust of 1 means unbroken contact."
     return _Section(
         "Trust map",

@@ -50,7 +50,7 @@ def test_floating_point_errors_of_users_are_not_raised_by_the_library():
         campaign.ask()
         campaign.maps()
         tb.check(campaign.posterior)
-        for model in (CoupledTrust(), PooledTrust(observation="censored")):
+        for model in (CoupledTrust(), PooledTrust(family="censored")):
             posterior = fit(campaign.missions, model, workspace=workspace)
         tb.inference.loo(posterior)
         follow = tb.inference.TrustFilter(posterior)

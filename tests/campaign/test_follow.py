@@ -63,7 +63,7 @@ def filter_of(campaign):
         return TrustFilter(campaign.posterior)
     model = campaign.model.for_features(campaign.workspace.features)
     draws = sample_prior(model, 2, 1000, campaign.state.seed_of("prior"), n_robots=3)
-    return TrustFilter(draws, 3, observation=model.observation)
+    return TrustFilter(draws, 3, family=model.family)
 
 
 @pytest.mark.parametrize(
@@ -71,8 +71,8 @@ def filter_of(campaign):
     [
         pytest.param(None, 0, id="prior"),
         pytest.param(None, 2, id="default"),
-        pytest.param(tb.models.PooledTrust(observation="beta_binomial"), 0, id="prior of counts"),
-        pytest.param(tb.models.PooledTrust(observation="beta_binomial"), 1, id="counts"),
+        pytest.param(tb.models.PooledTrust(family="beta_binomial"), 0, id="prior of counts"),
+        pytest.param(tb.models.PooledTrust(family="beta_binomial"), 1, id="counts"),
     ],
 )
 def test_trust_tick_by_tick_is_that_of_a_filter_of_whole_bounds(model, n_missions):

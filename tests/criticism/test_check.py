@@ -57,7 +57,7 @@ def test_place_effects_on_logits_are_reported_as_contact():
         )
         for m in drawn(place=-0.35)
     ]
-    found = checked(counted, PooledTrust(observation="beta_binomial", effects=(PlaceEffect(),)))
+    found = checked(counted, PooledTrust(family="beta_binomial", effects=(PlaceEffect(),)))
 
     assert found.table.loc["places", "label"] == "(0, 5)"
     assert -0.6 < found.table.loc["places", "size"] < -0.1

@@ -15,15 +15,13 @@ EFFECTS = (), (PlaceEffect(), RobotEffect())
 N_TICKS = 20
 N_DRAWS = 20
 MODELS = {
-    f"{model.__name__}, {family}, {len(effects)} effects": model(
-        observation=family, effects=effects
-    )
+    f"{model.__name__}, {family}, {len(effects)} effects": model(family=family, effects=effects)
     for model, family, effects in product(
         (PooledTrust, HierarchicalTrust, CoupledTrust), FAMILIES, EFFECTS
     )
 }
 MODELS |= {
-    f"PooledTrust, {family}, shared noise": PooledTrust(observation=family, shared_noise=True)
+    f"PooledTrust, {family}, shared noise": PooledTrust(family=family, shared_noise=True)
     for family in ("gaussian", "censored")
 }
 MODELS["PooledTrust, gaussian, deviation"] = PooledTrust(memory="deviation")

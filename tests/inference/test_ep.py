@@ -12,11 +12,11 @@ from trustbo.models.observations import Observations
 FEATURES = ("vegetation",)
 
 
-def small(observation, y):
+def small(family, y):
     """One robot, one mission, two bounds."""
     y = np.array(y, dtype=float).reshape(1, 2, 1)
     z = np.array([0.3, 0.8]).reshape(1, 2, 1, 1)
-    model = PooledTrust(observation=observation).for_features(FEATURES)
+    model = PooledTrust(family=family).for_features(FEATURES)
     return Density(model, Observations(y, z, np.full(y.shape, 40.0), FEATURES))
 
 
@@ -35,14 +35,14 @@ def by_quadrature(posterior, theta):
     for k in range(2):
         if not np.isnan(terms.y[0, k]):
             sd = predictor.noise_sd[0, 0, 0]
-            total = total + terms.family.log_prob(terms.y[0, k], 40.0, f[k], sd)
+            total = total + terms.likelihood.log_prob(terms.y[0, k], 40.0, f[k], sd)
     return logsumexp(total) + 2.0 * np.log(e[1] - e[0])
 
 
-@pytest.mark.parametrize("observation", ["censored", "beta_binomial"])
+@pytest.mark.parametrize("family", ["censored", "beta_binomial"])
 @pytest.mark.parametrize("y", [(1.0, 0.6), (1.0, 1.0), (0.0, 1.0), (0.4, np.nan)])
-def test_the_evidence_and_the_mean_weight_are_those_of_quadrature(observation, y):
-    posterior = small(observation, y)
+def test_the_evidence_and_the_mean_weight_are_those_of_quadrature(family, y):
+    posterior = small(family, y)
     theta = posterior.theta(np.array([[0.0, -0.5, 0.2]]))
     posterior.run_ep(theta)
     wanted = by_quadrature(posterior, theta)

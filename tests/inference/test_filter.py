@@ -153,7 +153,7 @@ def test_families_are_followed_to_the_trust_of_a_grid(family):
     """Moments are matched bound by bound: within .05 sd of the exact posterior."""
     p = OF_FAMILY[family]
     z, y, _ = counted_missions(family)
-    live = TrustFilter(constant(p), n_robots=1, observation=family)
+    live = TrustFilter(constant(p), n_robots=1, family=family)
     for j in range(len(y)):
         live.reset()
         for k in range(5):
@@ -165,7 +165,7 @@ def test_families_are_followed_to_the_trust_of_a_grid(family):
 
 
 def test_counts_need_their_numbers_of_ticks():
-    counting = TrustFilter(constant(OF_FAMILY["beta_binomial"]), 2, observation="beta_binomial")
+    counting = TrustFilter(constant(OF_FAMILY["beta_binomial"]), 2, family="beta_binomial")
     with pytest.raises(TrustboError, match="The beta-binomial family counts ticks"):
         counting.update(np.full((2, 2), 0.5), [1.0, 1.0])
     with pytest.raises(TrustboError, match="n_ticks"):
@@ -185,8 +185,8 @@ def test_coupled_robots_without_a_coupling_are_robots_apart(family):
         np.array([p.x0_mean]),
         np.array([p.x0_sd]),
     )
-    together = TrustFilter(coupled, observation=family)
-    apart = TrustFilter(constant(p, 1), 2, observation=family)
+    together = TrustFilter(coupled, family=family)
+    apart = TrustFilter(constant(p, 1), 2, family=family)
     for y in ([1.0, 0.5], [0.0, np.nan], [0.9, 1.0]):
         z = rng.uniform(size=(2, 2))
         one, other = (live.update(z, y, n_ticks=N_TICKS) for live in (together, apart))
@@ -208,7 +208,7 @@ def test_rates_ahead_have_the_interval_of_the_model():
     assert (np.abs(ahead.rate - ahead.mean) < error).all()
     assert (np.abs(ahead.rate_low - law.ppf(0.05)) < 2.2 * error).all()
     assert (np.abs(ahead.rate_high - law.ppf(0.95)) < 2.2 * error).all()
-    cut = TrustFilter(constant(OF_FAMILY["censored"], n), 2, observation="censored", max_draws=n)
+    cut = TrustFilter(constant(OF_FAMILY["censored"], n), 2, family="censored", max_draws=n)
     for _ in range(6):
         cut.update(np.ones((2, 2)), [1.0, 1.0])
     assert (cut.predict(np.ones((1, 2, 2))).rate_high == 1.0).all()

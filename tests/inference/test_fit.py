@@ -89,7 +89,7 @@ MODELS = {
     "places and robots": PooledTrust(effects=(PlaceEffect(), RobotEffect())),
     "by robot": HierarchicalTrust(effects=(PlaceEffect(),)),
     "coupled": CoupledTrust(effects=(PlaceEffect(), RobotEffect())),
-    "censored": PooledTrust(effects=(RobotEffect(),), observation="censored"),
+    "censored": PooledTrust(effects=(RobotEffect(),), family="censored"),
     "shared noise": PooledTrust(shared_noise=True, memory="deviation"),
 }
 

@@ -105,7 +105,7 @@ def test_a_mission_whose_weights_fail_is_left_out_of_a_refit(monkeypatch):
 @pytest.mark.parametrize(
     "model",
     [
-        PooledTrust(observation="censored"),
+        PooledTrust(family="censored"),
         HierarchicalTrust(),
         PooledTrust(shared_noise=True, effects=(RobotEffect(),)),
     ],

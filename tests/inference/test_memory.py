@@ -61,7 +61,7 @@ def test_the_evidence_without_memory_is_that_of_quadrature():
     [
         PooledTrust(),
         PooledTrust(effects=RobotEffect()),
-        PooledTrust(observation="censored"),
+        PooledTrust(family="censored"),
     ],
     ids=["pooled", "robots", "censored"],
 )

@@ -25,8 +25,8 @@ ROWS = {
     "places and robots": PooledTrust(effects=EFFECTS),
     "hierarchical": HierarchicalTrust(effects=(RobotEffect(),)),
     "coupled": CoupledTrust(),
-    "censored": PooledTrust(observation="censored", effects=(RobotEffect(),)),
-    "counts": PooledTrust(observation="beta_binomial"),
+    "censored": PooledTrust(family="censored", effects=(RobotEffect(),)),
+    "counts": PooledTrust(family="beta_binomial"),
 }
 
 

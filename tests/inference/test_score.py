@@ -66,7 +66,7 @@ def test_a_prediction_is_the_joint_normal_given_earlier_missions_averaged_over_d
 def test_log_scores_are_shares_of_simulated_rates(family):
     """Counts and limits have probabilities; rates inside, a density in bins around them."""
     z, _, missions = counted_missions(family)
-    posterior = fit(missions[:3], PooledTrust(observation=family), progress=False)
+    posterior = fit(missions[:3], PooledTrust(family=family), progress=False)
     mission = missions[4]
     scores = score(posterior, [mission])
     params, rng, n = params_of(posterior).flat(), np.random.default_rng(1), 100
@@ -121,7 +121,7 @@ def test_pit_of_rates_that_the_model_draws_are_uniform_with_limits_of_censored_o
     """Parameters and rates from one posterior: coverage is exact, point masses among them."""
     truth = OF_FAMILY["censored"]._replace(delta_w=0.4)
     z = np.random.default_rng(0).uniform(size=(60, 5, 1, 2))
-    model = PooledTrust(observation="censored")
+    model = PooledTrust(family="censored")
     y = draw_rates(truth, z, family="censored")
     assert 0.2 < np.isin(y, (0.0, 1.0)).mean() < 0.8
     path = [(0, k) for k in range(6)]

@@ -129,7 +129,7 @@ def test_the_report_is_one_page_with_the_path_and_every_figure(result, tmp_path)
 
 
 def test_the_report_has_contact_and_not_the_logit_of_it(result, tmp_path):
-    model = tb.models.PooledTrust(observation="beta_binomial")
+    model = tb.models.PooledTrust(family="beta_binomial")
     ends = (3, 0), (0, 2)
     found = tb.iterate(result.workspace, *ends, n_iterations=1, model=model, progress=False)
     write_report(tmp_path / "report.html", found)

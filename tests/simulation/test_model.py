@@ -61,7 +61,7 @@ def test_without_failures_rates_are_the_same(workspace):
         {"p_fail": np.zeros((2, 4))},
         {"p_fail": np.full((8, 2, 4), 1.5)},
         {"n_ticks": 5},
-        {"model": PooledTrust(observation="beta_binomial")},
+        {"model": PooledTrust(family="beta_binomial")},
         {"awareness": np.zeros((3, 2, 4, 3))},
     ],
 )

@@ -130,7 +130,7 @@ class Campaign(Result):
         model = require_model(model)
 
         self.policy = resolve_policy(policy)
-        base = Planner(workspace, start, goal, objective, family=model.observation, **options)
+        base = Planner(workspace, start, goal, objective, family=model.family, **options)
         settings = to_settings(
             base,
             model,

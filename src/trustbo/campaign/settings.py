@@ -95,7 +95,7 @@ def to_settings(
         "planner": to_plain("planner", planner),
         "fit": to_plain("fit", fit),
         "hazard": asdict(hazard),
-        "observation": model.observation,
+        "family": model.family,
         "model": model.in_short(),
         "model_record": model_to_record(model),
     }
@@ -119,7 +119,7 @@ def to_planner(settings: Mapping[str, Any], workspace: Workspace) -> Planner:
         settings["start"],
         settings["goal"],
         settings["objective"],
-        family=settings["observation"],
+        family=settings["family"],
         **settings["planner"],
     )
 

@@ -122,7 +122,7 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
 
     # The weight of line of sight already includes what all robots and missions have in common.
     draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
-    draws = draws / FAMILIES[posterior.attrs["observation"]].line_of_sight[0]
+    draws = draws / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
 
     probability = np.maximum((draws < -SIZE).mean(0), (draws > SIZE).mean(0))
     columns = {"effect": draws.mean(0), "sd": draws.std(0), "probability": probability}
@@ -173,7 +173,7 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     draws = total / inverse_gain.reshape(len(total), -1).mean(
         1, keepdims=True
     )  # of stationary trust
-    draws = draws / FAMILIES[posterior.attrs["observation"]].line_of_sight[0]
+    draws = draws / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
 
     effect = draws.mean(0)
     sure = (draws * np.sign(effect) > 0.0).mean(0)

@@ -103,7 +103,7 @@ class Density:
         columns = [effect.columns(observations) for effect in model.columns]
         self.ends = np.cumsum([0, *(U.shape[1] for U in columns)])
         self._U = self.layout.columns(sparse.hstack(columns, format="csr"))
-        self.exact = model.family.gaussian
+        self.exact = model.likelihood.gaussian
         self._chained = self.exact and observations.n_missions >= _CHAINED
 
         y = self.layout.rows(observations.contact_rate)
@@ -111,7 +111,7 @@ class Density:
             y, self._U, self.layout.label, apart=not self.exact, order=self._order()
         )
         if not self.exact:
-            self.terms = ep.Terms(model.family, y, self.layout.rows(observations.n_ticks))
+            self.terms = ep.Terms(model.likelihood, y, self.layout.rows(observations.n_ticks))
             self.reset_ep()
 
     @property
@@ -242,7 +242,7 @@ class Density:
     def _best_of_four_starts(self) -> np.ndarray:
         """Return the best of scores at which the noises have different sizes."""
         starts = np.zeros((len(_SIZES), self.n_scores))
-        unit = self.model.family.line_of_sight[0]
+        unit = self.model.likelihood.line_of_sight[0]
         ratio = unit * np.nanstd(self.observations.contact_rate) / _USUAL_NOISE
         spread = np.log(np.clip(ratio, *_SPREADS))
         starts[:, self.scores.noises] = spread - np.array(_SIZES)[:, None]

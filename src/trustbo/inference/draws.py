@@ -29,7 +29,7 @@ _NEXT_MISSION_SEED = 20261123
 """Seed of the next mission's robot effects, so that bands are reproducible."""
 _N_MEAN = 4096
 """Number of draws averaged to compute a prior mean."""
-_ATTRIBUTES = ("observation", "x0_mean", "x0_sd", "model_record")
+_ATTRIBUTES = ("family", "x0_mean", "x0_sd", "model_record")
 """Attributes that a posterior must have."""
 
 

@@ -38,14 +38,14 @@ _JITTER = 1e-12
 class Terms(NamedTuple):
     """Observations of all blocks and their family; each block must be a separate kind."""
 
-    family: Family
+    likelihood: Family
     y: np.ndarray  # (block, row), NaN where not measured
     n_ticks: np.ndarray  # (block, row)
 
     @property
     def linear(self) -> np.ndarray:
         """Mask (block, row) of the observations whose sites are exact."""
-        return ~np.isnan(self.y) & self.family.is_density(self.y)
+        return ~np.isnan(self.y) & self.likelihood.is_density(self.y)
 
 
 class Joint(NamedTuple):
@@ -78,13 +78,13 @@ class Sites(NamedTuple):
 
 def first_sites(terms: Terms) -> Sites:
     """Make initial sites (1, block, row), matched under a vague distribution of trust."""
-    unit, zero = terms.family.line_of_sight
+    unit, zero = terms.likelihood.line_of_sight
     y = terms.y
     m = np.full(y.shape, unit * (0.5 - zero))
     v = np.full(y.shape, (_VAGUE_SD * unit) ** 2)
     noise = np.full(y.shape, _USUAL_NOISE)
 
-    _, mean, var = terms.family.match(y, terms.n_ticks, m, v, noise)
+    _, mean, var = terms.likelihood.match(y, terms.n_ticks, m, v, noise)
     return _matched(terms, 1.0 / v[None], m / v, mean, var)
 
 
@@ -124,7 +124,7 @@ def log_evidence(
         v = 1.0 / rest
 
         # Moments of the cavity times the likelihood term, and the log evidence (3.57 and 3.65).
-        log_mass, mean, var = terms.family.match(terms.y, terms.n_ticks, m, v, sd)
+        log_mass, mean, var = terms.likelihood.match(terms.y, terms.n_ticks, m, v, sd)
         log_p = fit.log_p + np.where(seen, log_mass - _overlap(y, lam, m, v), 0.0).sum((1, 2))
 
         # The site that gives these moments (3.59), damped.
@@ -224,7 +224,9 @@ def draw_predictors(
         m = (a / d2 - eta[..., k]) / rest
         v = 1.0 / rest
 
-        own, log_mass = terms.family.draw(terms.y[:, k], terms.n_ticks[:, k], m, v, sd[..., k], rng)
+        own, log_mass = terms.likelihood.draw(
+            terms.y[:, k], terms.n_ticks[:, k], m, v, sd[..., k], rng
+        )
         is_exact = ~seen[:, k] | terms.linear[:, k]
         f[..., k] = np.where(is_exact, a + d * rng.standard_normal(a.shape), own)
         e[..., k] = (f[..., k] - a) / d

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import Names, read_labelled
 from trustbo.data import Cell, require_shares, require_unit_interval
-from trustbo.errors import TrustboError, one_line, require_pair, require_whole
+from trustbo.errors import Renamed, TrustboError, one_line, require_pair, require_whole
 from trustbo.inference.draws import names_in, params_of, require_posterior
 from trustbo.inference.importance import systematic
 from trustbo.models.families import FAMILIES
@@ -70,17 +70,18 @@ class TrustFilter:
         params: Parameter draws with the leading axis (draw,).
         weights: Current weights (draw,) of the draws, which sum to 1.
         n_bounds: Number of bounds since the last `reset`.
-        family: Observation family.
+        likelihood: Observation family.
         space: State-space form of each draw.
     """
 
+    @Renamed(observation="family")
     @computing()
     def __init__(
         self,
         posterior: xr.DataTree | Params,
         n_robots: int | None = None,
         *,
-        observation: str = "gaussian",
+        family: str = "gaussian",
         max_draws: int = 1000,
         workspace: Workspace | None = None,
     ) -> None:
@@ -89,7 +90,7 @@ class TrustFilter:
         Args:
             posterior: DataTree from `fit`, or parameter draws with the leading axis (draw,).
             n_robots: Number of robots; needed only with `TrustParams`.
-            observation: Observation family of parameter draws; ignored for a DataTree.
+            family: Observation family of parameter draws; ignored for a DataTree.
             max_draws: Maximum number of draws; if there are more, evenly spaced draws are selected.
             workspace: Workspace whose robots and features the filter follows, in this order. By
                 default, arrays without labels are in the order of the draws.
@@ -109,7 +110,7 @@ class TrustFilter:
             if "constant_data" in posterior.children:  # without a map, any awareness is valid
                 self._bounded = bool((posterior["constant_data"]["row"] >= 0).any())
             n_robots = posterior.attrs["n_robots"]
-            observation = posterior.attrs["observation"]
+            family = posterior.attrs["family"]
             if workspace is None:
                 self._names = {axis: names_in(posterior, axis) or None for axis in self._names}
             posterior = params_of(posterior, workspace, next_mission=True)
@@ -133,8 +134,8 @@ class TrustFilter:
         max_draws = require_whole("max_draws", max_draws, 1)
         kept = np.linspace(0, n_draws - 1, min(n_draws, max_draws)).astype(int)
         self.params: Params = flat.draw(kept)
-        self.family = FAMILIES[observation]
-        self.space = self.params.state_space(self._n_robots, adds_noise=self.family.adds_noise)
+        self.likelihood = FAMILIES[family]
+        self.space = self.params.state_space(self._n_robots, adds_noise=self.likelihood.adds_noise)
         self.reset()
 
     def reset(self) -> None:
@@ -193,13 +194,13 @@ class TrustFilter:
         if ticks.ndim == 0:
             ticks = np.full(y.shape, ticks)
         require_shares(y, ticks)
-        if self.family.needs_ticks and (np.isnan(ticks) & ~np.isnan(y)).any():
+        if self.likelihood.needs_ticks and (np.isnan(ticks) & ~np.isnan(y)).any():
             raise TrustboError(NO_TICKS)
 
         predicted = kalman.predict(self.space, self._belief, inputs)
         rates = self.space.grouped(y)
         counts = self.space.grouped(ticks)
-        self._belief, gained = kalman.update(self.space, predicted, rates, counts, self.family)
+        self._belief, gained = kalman.update(self.space, predicted, rates, counts, self.likelihood)
 
         # Draws that predicted the rates better get more weight.
         self._log_weight = self._log_weight + gained  # a new array, as copies share the old one
@@ -228,7 +229,7 @@ class TrustFilter:
 
         inputs = self.inputs(given, path)
         ticks = self.space.grouped(np.full(given.shape[:2], _TICKS))
-        ahead = kalman.forecast(self.space, self._belief, inputs, ticks, self.family, rng)
+        ahead = kalman.forecast(self.space, self._belief, inputs, ticks, self.likelihood, rng)
         trust = []
         rates = []
         for belief, drawn in ahead:

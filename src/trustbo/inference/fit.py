@@ -329,7 +329,7 @@ def _record(model: TrustModel, density: Density) -> dict[str, Any]:
         "n_robots": observations.n_robots,
         "n_missions": observations.n_missions,
         **model.x0,
-        "resolution": observations.resolution if model.family.adds_noise else 0.0,
+        "resolution": observations.resolution if model.likelihood.adds_noise else 0.0,
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
         **{f"{name}_version": version for name, version in VERSIONS.items()},
     }

@@ -145,7 +145,7 @@ def _rates(
     root = each(_root(predictor.covariance), density.blocks.label[density.blocks.kind])
     f = density.layout.unstack(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
     sd = density.layout.unstack(np.broadcast_to(predictor.noise_sd, mean.shape))
-    return density.model.family.sample(f, sd, density.observations.n_ticks, rng)
+    return density.model.likelihood.sample(f, sd, density.observations.n_ticks, rng)
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:

@@ -98,7 +98,7 @@ def loo(
             bar.update()
 
     # Densities of tick counts are comparable between families; NaN where ticks are unknown.
-    shift = fitted.model.family.log_resolution(
+    shift = fitted.model.likelihood.log_resolution(
         fitted.observations.contact_rate, fitted.observations.n_ticks
     ).sum((1, 2))
     if not np.isnan(shift).any():

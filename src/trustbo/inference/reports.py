@@ -121,7 +121,7 @@ def _of_person(
     the same total weight.
     """
     observations = ahead.observations
-    family = ahead.model.family
+    likelihood = ahead.model.likelihood
     sd = draws.theta["delta_v"]
     _, n_bounds, n_robots = observations.contact_rate.shape
     y = observations.contact_rate[j].ravel()
@@ -155,7 +155,7 @@ def _of_person(
             d = root[:, r, r]
             white[:, r] = rng.standard_normal(len(mean))
             if earlier and not np.isnan(y[r]):
-                f, log_mass = family.draw(y[r], ticks[r], a, d**2, sd, rng)
+                f, log_mass = likelihood.draw(y[r], ticks[r], a, d**2, sd, rng)
                 white[:, r] = (f - a) / d
                 log_weight = log_weight + log_mass
 
@@ -171,19 +171,19 @@ def _prediction(
     rng: np.random.Generator,
 ) -> dict[str, Any]:
     """Predict a report given trust ~ N(center, var) in each draw, with weights (draw,)."""
-    family = ahead.model.family
+    likelihood = ahead.model.likelihood
     sd = draws.theta["delta_v"]
     y = ahead.observations.contact_rate[slot]
     ticks = ahead.observations.n_ticks[slot]
 
     found: dict[str, Any] = {}
     if not np.isnan(y):
-        log_mass, _, _ = family.match(y, ticks, center, var, sd)
+        log_mass, _, _ = likelihood.match(y, ticks, center, var, sd)
         found["log_score"] = np.log(max(weight @ np.exp(log_mass), _LEAST_MASS))
 
     if levels:  # the probability of each answer is known
         answers = np.arange(levels) / (levels - 1.0)
-        log_masses = [family.match(answer, ticks, center, var, sd)[0] for answer in answers]
+        log_masses = [likelihood.match(answer, ticks, center, var, sd)[0] for answer in answers]
         mass = weight @ np.exp(np.stack(log_masses, axis=1))
         mass = np.maximum(mass, _LEAST_MASS) / mass.sum()
         which = np.searchsorted(np.cumsum(mass) - _CLOSE, QUANTILES)
@@ -192,7 +192,7 @@ def _prediction(
 
     # Otherwise, draw a report from each draw of trust, for weighted quantiles.
     trust = center + np.sqrt(var) * rng.standard_normal(len(var))
-    drawn = family.sample(trust, sd, ticks, rng)
+    drawn = likelihood.sample(trust, sd, ticks, rng)
 
     order = np.argsort(drawn)
     which = np.searchsorted(np.cumsum(weight[order]), QUANTILES)

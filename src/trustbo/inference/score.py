@@ -85,7 +85,7 @@ def score(
         if j > 0 and tree is not trees[j - 1]:
             trust = _follow(in_order_of(tree, robots, features))
 
-        require_ticks(trust.family, y, observations.n_ticks)
+        require_ticks(trust.likelihood, y, observations.n_ticks)
         k = slice(len(mission.bounds))
         rng = stream(seed, "score", j)
         ticks = observations.n_ticks[j, k]
@@ -98,7 +98,7 @@ def score(
 
     # Scores of tick counts are comparable between families; NaN where ticks are unknown.
     attrs = {"log_score_of": "contact_rate"}
-    shift = trust.family.log_resolution(y, observations.n_ticks)
+    shift = trust.likelihood.log_resolution(y, observations.n_ticks)
     if not np.isnan(shift).any():
         columns["log_score"] += shift
         attrs["log_score_of"] = "ticks"
@@ -132,14 +132,14 @@ def _predict(
 
     counts = trust.space.grouped(ticks)
     ahead = kalman.forecast(
-        trust.space, trust.start(), trust.inputs(z, path), counts, trust.family, rng
+        trust.space, trust.start(), trust.inputs(z, path), counts, trust.likelihood, rng
     )
 
     log_scores = np.full(y.shape, np.nan)
     drawn = []
     for k, (belief, rates) in enumerate(ahead):
         of_rates = kalman.marginal_log_densities(
-            trust.space, belief, trust.space.grouped(y[k]), counts[k], trust.family
+            trust.space, belief, trust.space.grouped(y[k]), counts[k], trust.likelihood
         )
 
         # Log of the mean density over the draws of the parameters.

@@ -213,7 +213,7 @@ def with_latent(
     # Log likelihoods of tick counts are comparable between families; NaN where ticks are unknown.
     likelihood = latent.log_likelihood
     likelihood_of = "contact_rate"
-    shift = fitted.model.family.log_resolution(
+    shift = fitted.model.likelihood.log_resolution(
         fitted.observations.contact_rate, fitted.observations.n_ticks
     ).sum((1, 2))
     if not np.isnan(shift).any():

@@ -8,6 +8,7 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 
+from trustbo.errors import Renamed
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import CoupledWeights
 from trustbo.models.model import TrustModel
@@ -17,6 +18,7 @@ from trustbo.statespace.form import coupled_robots
 from trustbo.statespace.matrices import namespace
 
 
+@Renamed(observation="family")
 @dataclass(frozen=True, repr=False)
 class CoupledTrust(TrustModel):
     """Model in which robots influence each other and have separate parameters, equations (1)-(2).
@@ -48,7 +50,7 @@ class CoupledTrust(TrustModel):
         column = np.tril_indices(n, -1)[1]
         shape = priors.concentration + 0.5 * (n - 2 - column)
         partials = {"partial_w": dist.Beta(shape, shape)}
-        if self.family.adds_noise:
+        if self.likelihood.adds_noise:
             partials["partial_v"] = dist.Beta(shape, shape)
 
         return named | partials
@@ -89,7 +91,7 @@ class CoupledTrust(TrustModel):
             theta["Delta_w"],
             theta["Delta_v"],
             **self.x0,
-            adds_noise=self.family.adds_noise,
+            adds_noise=self.likelihood.adds_noise,
         )
 
     def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:

@@ -14,7 +14,7 @@ from scipy import sparse
 
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_choice, require_list
+from trustbo.errors import Renamed, TrustboError, require_choice, require_list
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Effect, Theta, sample_columns
 from trustbo.models.effects.weights import Weights
@@ -32,6 +32,7 @@ MODELS: dict[str, type["TrustModel"]] = {}
 _JITTER = 1e-13  # added to the covariance of trust, so that rounding does not make it singular
 
 
+@Renamed(observation="family")
 @dataclass(frozen=True, repr=False)
 class TrustModel(Summary, ABC):
     """Base class of trust models.
@@ -43,18 +44,18 @@ class TrustModel(Summary, ABC):
     Attributes:
         priors: Prior on each parameter. The default depends on the observation family and the
             feature names; see `Priors.of`.
-        observation: Observation family: `"gaussian"` as in the paper, `"censored"` for rates that
+        family: Observation family: `"gaussian"` as in the paper, `"censored"` for rates that
             are censored at 0 and 1, or `"beta_binomial"` for the number of ticks in
             contact out of `Bound.n_ticks`, with trust on the logit scale.
         effects: Effects on the drift, such as `PlaceEffect()` for places and `RobotEffect()` for
             each robot in each mission. The paper's models have no effects.
 
     Raises:
-        TrustboError: If `observation` is unknown, or `effects` contains a wrong or repeated class.
+        TrustboError: If `family` is unknown, or `effects` contains a wrong or repeated class.
     """
 
     priors: Priors = None  # pyright: ignore[reportAssignmentType]
-    observation: str = "gaussian"
+    family: str = "gaussian"
     effects: tuple[Effect, ...] = ()
     memory: ClassVar[str] = "level"  # see `PooledTrust`
 
@@ -62,9 +63,9 @@ class TrustModel(Summary, ABC):
         MODELS[cls.__name__] = cls
 
     def __post_init__(self) -> None:
-        require_choice("observation", self.observation, FAMILIES)
+        require_choice("family", self.family, FAMILIES)
         if self.priors is None:
-            object.__setattr__(self, "priors", Priors.default(self.observation))
+            object.__setattr__(self, "priors", Priors.default(self.family))
         elif not isinstance(self.priors, Priors):
             raise TrustboError(f"priors must be a trustbo.models.Priors; got {self.priors!r}.")
 
@@ -139,7 +140,7 @@ class TrustModel(Summary, ABC):
         return Layout.of(
             observations.contact_rate,
             joint=self.joint,
-            exchangeable=self.exchangeable and contrasts and self.family.gaussian,
+            exchangeable=self.exchangeable and contrasts and self.likelihood.gaussian,
             carried=self.carried(observations),
             apart=type(self).random_effects is not TrustModel.random_effects,
         )
@@ -162,9 +163,9 @@ class TrustModel(Summary, ABC):
         return {name: () for effect in self.effects for name in effect.names}
 
     @property
-    def family(self) -> Family:
-        """The observation family."""
-        return FAMILIES[self.observation]
+    def likelihood(self) -> Family:
+        """The observation family, which is the likelihood of a contact rate given trust."""
+        return FAMILIES[self.family]
 
     @property
     def x0(self) -> dict[str, float]:
@@ -187,7 +188,7 @@ class TrustModel(Summary, ABC):
         Noise with standard deviation `resolution` is added to `delta_v` in quadrature. Without this
         noise, the density of rates that fit perfectly, such as constant rates, would be unbounded.
         """
-        if self.family.adds_noise:
+        if self.likelihood.adds_noise:
             noise = values["delta_v"]
             noise = namespace(noise).hypot(noise, resolution)
             values = {**values, "delta_v": noise}
@@ -195,7 +196,7 @@ class TrustModel(Summary, ABC):
 
     def noise_without(self, delta_v: np.ndarray, resolution: float) -> np.ndarray:
         """Return the `delta_v` that has the prior, given one to which `theta` added noise."""
-        if not self.family.adds_noise:
+        if not self.likelihood.adds_noise:
             return delta_v
 
         # Rounding can make the difference of the squares slightly negative.
@@ -216,7 +217,7 @@ class TrustModel(Summary, ABC):
                 a path jumps or leaves the workspace.
         """
         observations = Observations.from_missions(missions)
-        require_ticks(self.family, observations.contact_rate, observations.n_ticks)
+        require_ticks(self.likelihood, observations.contact_rate, observations.n_ticks)
         for effect in self.effects:
             observations = effect.add_data(observations, missions, workspace)
         return observations
@@ -226,9 +227,9 @@ class TrustModel(Summary, ABC):
 
         `fit` and campaigns call this method; see `Priors.of`.
         """
-        if self.priors is not Priors.default(self.observation):
+        if self.priors is not Priors.default(self.family):
             return self
-        return replace(self, priors=Priors.of(tuple(features), self.observation))
+        return replace(self, priors=Priors.of(tuple(features), self.family))
 
     def program(self, observations: Observations) -> None:
         """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.
@@ -248,7 +249,7 @@ class TrustModel(Summary, ABC):
             [effect.columns(observations) for effect in self.columns], format="csr"
         )
 
-        if self.family.gaussian:
+        if self.likelihood.gaussian:
             carried = np.broadcast_to(self.carried(observations), U.shape[1:])
             dense = U.toarray()
             inputs = Inputs(
@@ -277,7 +278,7 @@ class TrustModel(Summary, ABC):
         seen = ~np.isnan(y)
         rates = np.where(seen, y, 0.5)
         counts = np.where(ticks > 0.0, ticks, 1.0)
-        log_p = self.family.log_prob(rates, counts, f, predictor.noise_sd[0])
+        log_p = self.likelihood.log_prob(rates, counts, f, predictor.noise_sd[0])
         numpyro.factor("contact_rate", jnp.where(seen, log_p, 0.0).sum())
 
     def options(self) -> dict[str, Any]:
@@ -289,8 +290,8 @@ class TrustModel(Summary, ABC):
 
     def _rows(self) -> Rows:
         return [
-            ("rates", self.observation),
-            *((n, str(v)) for n, v in self.options().items() if n != "observation"),
+            ("rates", self.family),
+            *((n, str(v)) for n, v in self.options().items() if n != "family"),
             *(("effects", f"of {effect.group}") for effect in self.effects),
         ]
 
@@ -300,8 +301,8 @@ class TrustModel(Summary, ABC):
         others = [
             f"{name} {value}"
             for name, value in self.options().items()
-            if name != "observation" and value != defaults.get(name)
+            if name != "family" and value != defaults.get(name)
         ]
         return ", ".join(
-            [type(self).__name__, *(e.group for e in self.effects), self.observation, *others]
+            [type(self).__name__, *(e.group for e in self.effects), self.family, *others]
         )

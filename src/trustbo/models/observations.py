@@ -13,7 +13,7 @@ from trustbo.stacking import require_same_team
 
 NO_TICKS = (
     "The beta-binomial family counts ticks. Give the tick count of each bound as n_ticks, for "
-    'example in Mission.from_arrays, or use observation="censored".'
+    'example in Mission.from_arrays, or use family="censored".'
 )
 UNKNOWN_RESOLUTION = 0.005
 """Resolution assumed for rates with an unknown tick count."""
@@ -120,13 +120,13 @@ class Observations(NamedTuple):
         return self._replace(contact_rate=contact_rate)
 
 
-def require_ticks(family: Family, contact_rate: np.ndarray, n_ticks: np.ndarray) -> None:
+def require_ticks(likelihood: Family, contact_rate: np.ndarray, n_ticks: np.ndarray) -> None:
     """Raise TrustboError if the family needs n_ticks and a measured rate lacks it.
 
     Both arrays have the shape (mission, bound, robot).
     """
     without = ~np.isnan(contact_rate) & ~(n_ticks >= 1.0)
-    if family.needs_ticks and without.any():
+    if likelihood.needs_ticks and without.any():
         j, k, i = np.argwhere(without)[0]
         raise TrustboError(
             f"robot {i} has a rate but no n_ticks at bound {k + 1} of mission {j}. {NO_TICKS}"

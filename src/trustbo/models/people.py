@@ -9,7 +9,7 @@ import numpyro.distributions as dist
 
 from trustbo.data import levels_of
 from trustbo.display import Rows
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import Renamed, TrustboError, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Theta
 from trustbo.models.families import FAMILIES, Family, Levels
@@ -26,6 +26,7 @@ SDS = "tau_start", "tau_level", "tau_gain"
 """Names of the standard deviations of the personal coefficients."""
 
 
+@Renamed(observation="family")
 @dataclass(frozen=True, repr=False)
 class HumanTrust(PooledTrust):
     """Model of self-reported trust as a base level plus decaying effects of past outcomes.
@@ -58,7 +59,7 @@ class HumanTrust(PooledTrust):
 
     def __post_init__(self) -> None:
         levels_of(self.scale)
-        object.__setattr__(self, "observation", "censored")  # only on the unit scale; see `family`
+        object.__setattr__(self, "family", "censored")  # only on the unit scale; see `likelihood`
         if self.priors is None:
             object.__setattr__(self, "priors", _default_priors())
         super().__post_init__()
@@ -78,8 +79,8 @@ class HumanTrust(PooledTrust):
         return super().hyperpriors(n_robots, n_features) | sds
 
     @cached_property
-    def family(self) -> Family:  # pyright: ignore
-        """See `TrustModel.family`."""
+    def likelihood(self) -> Family:  # pyright: ignore
+        """See `TrustModel.likelihood`."""
         levels = levels_of(self.scale)
         return Levels(levels) if levels else FAMILIES["censored"]
 

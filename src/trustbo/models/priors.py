@@ -96,16 +96,16 @@ class Priors(Summary):
 
     @classmethod
     @cache
-    def default(cls, observation: str) -> "Priors":
+    def default(cls, family: str) -> "Priors":
         """Return the default priors for an observation family, as the same object in every call.
 
         The family `"beta_binomial"` has wider priors because trust is a logit: beta_m ~ N(0, 2^2),
         b ~ N(0, 1), delta_w ~ HalfNormal(0.5) and x_0 ~ N(0, 1.5^2).
         """
-        return cls(**FAMILIES[observation].priors())
+        return cls(**FAMILIES[family].priors())
 
     @classmethod
-    def of(cls, features: Sequence[str], observation: str = "gaussian") -> "Priors":
+    def of(cls, features: Sequence[str], family: str = "gaussian") -> "Priors":
         """Return the default priors for features with the given names.
 
         The feature `line_of_sight` predicts the contact rate. Stationary trust therefore has prior
@@ -116,15 +116,15 @@ class Priors(Summary):
         0.5. Without line of sight, the result is `default`.
         """
         features = require_list("features", features, str, "give the names of the features")
-        require_choice("observation", observation, FAMILIES)
+        require_choice("family", family, FAMILIES)
 
-        default = cls.default(observation)
+        default = cls.default(family)
         is_sight = np.array([is_line_of_sight(name) for name in features])
         if not is_sight.any():
             return default
 
         n = int(is_sight.sum())
-        slope, zero = FAMILIES[observation].line_of_sight
+        slope, zero = FAMILIES[family].line_of_sight
         with own_settings():
             sd = np.where(is_sight, _SIGHT_SD / np.sqrt(n), _FEATURE_SD)
             return replace(

@@ -22,7 +22,7 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
         **model.options(),
         "priors": model.priors.describe(),
         "effects": [{"kind": type(effect).__name__, **asdict(effect)} for effect in effects],
-        "by_feature": model.priors is Priors.default(model.observation),
+        "by_feature": model.priors is Priors.default(model.family),
     }
     return json.loads(json.dumps(record))  # tuples become lists, as in a file
 
@@ -45,7 +45,7 @@ def model_from_record(
     # The priors are default if one of these models has the record: `Priors.default` (the object
     # itself, which stands for priors by feature), equal priors as another object, or `Priors.of`.
     default = with_default_priors(record)
-    of_features = Priors.of(features, record["observation"])
+    of_features = Priors.of(features, record["family"])
     for priors in (default.priors, replace(default.priors), of_features):
         model = replace(default, priors=priors)
         if model_to_record(model) == record:

@@ -84,7 +84,7 @@ class DrawnPaths:
     def _value(self, recursion: Recursion, path: Sequence[Cell]) -> np.ndarray:
         """Compute the value of a path for each draw of `recursion`, shape (draw,)."""
         problem = self.problem
-        along = capped(problem.objective, problem.family, recursion.along(path))
+        along = capped(problem.objective, problem.likelihood, recursion.along(path))
         value = problem.value_along(path, states_along(along).mean(-1), along.noise_sd)
         return value - problem.failure_along(path)
 

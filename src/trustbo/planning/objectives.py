@@ -101,23 +101,23 @@ def weights_of(objective: Objective, recursion: Recursion, view: Array, longest:
     return Weights(lags @ powers, constant, objective.scale(n.astype(float)))
 
 
-def has_history(objective: Objective, family: Family) -> bool:
+def has_history(objective: Objective, likelihood: Family) -> bool:
     """Return whether the objective is a nonlinear function of trust.
 
     If so, the search has to keep track of trust and requires B0 >= 0. Otherwise, the score of a
     path is a weighted sum of the drifts of its bounds.
     """
-    return objective.of_contact and family.expected_rate != "identity"
+    return objective.of_contact and likelihood.expected_rate != "identity"
 
 
-def capped(objective: Objective, family: Family, recursion: Recursion) -> Recursion:
+def capped(objective: Objective, likelihood: Family, recursion: Recursion) -> Recursion:
     """Cap the drift and the initial trust, so that trust never exceeds 1 and no rate exceeds 1.
 
     If the drift of each state is at most 1 minus the row sum of B0, B0 >= 0 and x_0 <= 1, trust is
     at most 1. A loop then never increases the value. Only lost_contact with rates that are linear
     in trust needs the cap; for other objectives or rates, the recursion is returned unchanged.
     """
-    if not objective.of_contact or has_history(objective, family):
+    if not objective.of_contact or has_history(objective, likelihood):
         return recursion
 
     most = 1.0 - recursion.transition.sum(-1)[..., None, None, None]

@@ -111,7 +111,7 @@ class Planner(Summary):
             ("from", f"{self.start} to {self.goal}"),
             ("objective", problem.objective.name),
             ("paths", f"{paths.shortest} to {paths.longest} bounds ({paths.max_bounds})"),
-            ("rates", problem.family.name),
+            ("rates", problem.likelihood.name),
             ("risk", "given for each bound" if problem.risk is not None else "not given"),
         ]
 
@@ -338,7 +338,7 @@ class Planner(Summary):
                 "Give other parameters, or use `plan` to find a path."
             )
 
-        contact = capped(LOST_CONTACT, problem.family, recursion)
+        contact = capped(LOST_CONTACT, problem.likelihood, recursion)
         grid = self.workspace.grid
         bounds = problem.paths.bounds
         length = np.hypot(*(STEPS * (grid.cell_height, grid.cell_width)).T)  # (move,)
@@ -348,7 +348,7 @@ class Planner(Summary):
 
         bound_cost = of_bounds(problem.bound_cost)
         settled = of_bounds(recursion.steady_state())
-        rate = problem.family.mean_rate(of_bounds(contact.steady_state()), recursion.noise_sd)
+        rate = problem.likelihood.mean_rate(of_bounds(contact.steady_state()), recursion.noise_sd)
         values = {
             "length": of_bounds(length[:, None, None]),
             "drift": of_bounds(recursion.drift.mean(0)),
@@ -491,6 +491,6 @@ def _value_along(
 
     # Capping the trust of each draw causes bias, so the value of each draw uses uncapped trust.
     # However, the contact lost on a path cannot be negative.
-    team = capped(problem.objective, problem.family, trust_recursion(of_path, z, x0))
+    team = capped(problem.objective, problem.likelihood, trust_recursion(of_path, z, x0))
     mean = problem.value_along(cells, states_along(team).mean(-1), team.noise_sd).mean()
     return trust, float(mean), np.minimum(values, -problem.bound_cost_along(cells))

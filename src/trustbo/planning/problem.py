@@ -50,7 +50,7 @@ class Problem:
     Attributes:
         paths: Admissible paths.
         objective: One of the objectives in `OBJECTIVES`.
-        family: Observation family of the contact rates.
+        likelihood: Observation family of the contact rates.
         bound_cost: Additional cost of each bound, shape (move, row, col).
         max_failure: Largest failure probability allowed for a path, or None for no limit.
         failure_cost: Cost of a failure in bounds; None for the smallest number of bounds of a path.
@@ -59,7 +59,7 @@ class Problem:
 
     paths: AdmissiblePaths
     objective: Objective
-    family: Family
+    likelihood: Family
     bound_cost: np.ndarray
     max_failure: float | None = None
     failure_cost: float | None = None
@@ -106,7 +106,7 @@ class Problem:
         objective = self.objective
         bound_cost = self.bound_cost_along(path)
         if objective.of_contact:
-            lost = 1.0 - self.family.mean_rate(trust, noise_sd[..., None])
+            lost = 1.0 - self.likelihood.mean_rate(trust, noise_sd[..., None])
             return objective.value(-lost.sum(-1) - bound_cost)
 
         n_bounds = trust.shape[-1]
@@ -197,9 +197,9 @@ class Problem:
             TrustboError: If beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
-        history = has_history(self.objective, self.family)
+        history = has_history(self.objective, self.likelihood)
         self._require_valid(recursion, history)
-        recursion = capped(self.objective, self.family, recursion).flat()
+        recursion = capped(self.objective, self.likelihood, recursion).flat()
 
         graph = self.paths.graph
         n_draws, n_states = recursion.start.shape
@@ -216,7 +216,7 @@ class Problem:
         loss = LOGISTIC  # not used, because no trust is followed
         if history:  # the cost depends on trust itself and is not a weighted sum of drifts
             n_trust = n_states
-            loss = LOSSES[self.family.expected_rate]
+            loss = LOSSES[self.likelihood.expected_rate]
             weights = Weights(0.0 * weights.per_bound, 0.0 * weights.constant, weights.scale)
 
         risks = self.risks or Risks(np.zeros((len(bound_cost), 1)), np.zeros(1), np.inf)

@@ -37,14 +37,14 @@ def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
     problem = planner.problem
     mean = mean_of(params, planner.workspace)
 
-    if problem.risks is not None or has_history(problem.objective, problem.family):
+    if problem.risks is not None or has_history(problem.objective, problem.likelihood):
         plans = [planner.evaluate(path, mean) for path in every_path(problem.paths)]
         feasible = [one for one in plans if not one.infeasible]
         if not feasible:
             return planner.plan(mean)  # raises InfeasibleError
         return max(feasible, key=lambda one: one.value)
 
-    recursion = capped(problem.objective, problem.family, problem.recursion(mean))
+    recursion = capped(problem.objective, problem.likelihood, problem.recursion(mean))
     plans = [planner.evaluate(path, mean) for path in shortest_paths(planner, recursion)]
     return max(plans, key=lambda one: one.value)
 

@@ -69,9 +69,11 @@ class ModelSimulator(DescribedSimulator):
             raise TrustboError(f"params must be a single draw; got leading axes {params.leading}.")
         check_params(params, shape[0], shape[-1])
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
-        if (self.n_ticks is not None) != self.model.family.needs_ticks:
-            needs = "needs" if self.model.family.needs_ticks else "does not use"
-            raise TrustboError(f"family {self.model.family.name!r} {needs} n_ticks; got {n_ticks}.")
+        if (self.n_ticks is not None) != self.model.likelihood.needs_ticks:
+            needs = "needs" if self.model.likelihood.needs_ticks else "does not use"
+            raise TrustboError(
+                f"family {self.model.likelihood.name!r} {needs} n_ticks; got {n_ticks}."
+            )
         bounds = shape[1:4]
         self.p_fail = None if p_fail is None else _require_probabilities(p_fail, bounds)
 
@@ -83,7 +85,7 @@ class ModelSimulator(DescribedSimulator):
         rng = np.random.default_rng([0, require_whole("seed", seed, 0), _STREAM])
         of_bounds = np.full(z.shape[:2], np.nan if self.n_ticks is None else self.n_ticks)
         params = self.params.flat()
-        space = params.state_space(z.shape[1], adds_noise=self.model.family.adds_noise)
+        space = params.state_space(z.shape[1], adds_noise=self.model.likelihood.adds_noise)
         u = np.stack([params.of_bound(of_bound) for of_bound in z])  # (bound, draw, robot)
         if params.places:
             u = u + np.moveaxis(params.of_places(bounds_along(cells)), -2, 0)
@@ -92,7 +94,7 @@ class ModelSimulator(DescribedSimulator):
         offset = np.broadcast_to(params.initial_offset, 1)[:, None, None]
         start = kalman.initial(space, z.shape[1] // space.n_members, offset)
         ticks = space.grouped(of_bounds)
-        drawn = kalman.forecast(space, start, inputs, ticks, self.model.family, rng)
+        drawn = kalman.forecast(space, start, inputs, ticks, self.model.likelihood, rng)
         rates = np.clip([of_bound[0] for _, of_bound in drawn], 0.0, 1.0)
         n, status = self._end(cells, seed)
         ticks = None if self.n_ticks is None else np.full(rates[:n].shape, self.n_ticks)

@@ -29,7 +29,7 @@ class Family(ABC):
     """
 
     name: ClassVar[str]
-    """Name of the family, as given in the argument `observation`."""
+    """Name of the family, as given in the argument `family`."""
     gaussian: ClassVar[bool] = False
     """Whether rates are the linear predictor plus normal noise, which allows exact integration."""
     needs_ticks: ClassVar[bool] = False
