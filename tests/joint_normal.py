@@ -16,10 +16,10 @@ class Dense:
     def __init__(self, model, observations, theta):
         """Form the joint normal."""
         n_missions, K, R = observations.contact_rate.shape
-        U = np.concatenate([e.columns(observations).toarray() for e in model.columns], axis=1)
+        U = np.concatenate([e.design(observations).toarray() for e in model.terms], axis=1)
         U = U.reshape(n_missions, K, R, -1)
         means, precisions = [], []
-        for effect in model.columns:
+        for effect in model.terms:
             mean, parts = effect.prior(theta, observations)
             precisions += [part[0] if part.ndim == 3 else np.diag(part[0]) for part in parts]
             means.append(np.zeros(sum(p.shape[1] for p in parts)) if mean is None else mean[0])

@@ -81,7 +81,7 @@ def test_effects_split_into_chains_have_the_same_evidence_and_draws(name, gaps):
         dense = Dense(posterior.model, posterior.observations, at(theta, slice(i, i + 1)))
         np.testing.assert_allclose(value, dense.log_density(), rtol=1e-9)
 
-    drawn = posterior.draw_columns(at(theta, np.zeros(4000, int)), np.random.default_rng(0))
+    drawn = posterior.draw_coefficients(at(theta, np.zeros(4000, int)), np.random.default_rng(0))
     mean, cov = Dense(
         posterior.model, posterior.observations, at(theta, slice(0, 1))
     ).coefficients()
@@ -128,15 +128,15 @@ def test_a_matrix_that_is_not_positive_definite_costs_its_point_alone():
 
 
 @pytest.mark.parametrize("name", ["shared noise", "coupled, places and robots"])
-def test_columns_drawn_often_at_visited_points_have_the_moments_of_the_joint_normal(name):
+def test_coefficients_drawn_often_at_visited_points_have_the_moments_of_the_joint_normal(name):
     posterior, theta = posterior_of(name)
     z = np.repeat(0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores)), 500, 0)
     rng = np.random.default_rng(0)
-    log_p, columns = posterior.visit(z, rng)
+    log_p, coefficients = posterior.visit(z, rng)
     np.testing.assert_allclose(log_p[::500], posterior.log_density(z[::500]), rtol=1e-12)
     for k in range(3):
         first = np.arange(500 * k, 500 * (k + 1))
-        drawn = columns.draw(np.repeat(first, 20), rng)
+        drawn = coefficients.draw(np.repeat(first, 20), rng)
         one = at(theta, slice(k, k + 1))
         mean, cov = Dense(posterior.model, posterior.observations, one).coefficients()
         sd = np.sqrt(np.diag(cov))
@@ -146,10 +146,10 @@ def test_columns_drawn_often_at_visited_points_have_the_moments_of_the_joint_nor
 
 
 @pytest.mark.parametrize("name", ["shared noise", "coupled, places and robots"])
-def test_drawn_columns_have_the_moments_of_the_joint_normal(name):
+def test_drawn_coefficients_have_the_moments_of_the_joint_normal(name):
     posterior, theta = posterior_of(name)
     one = at(theta, slice(0, 1))
-    drawn = posterior.draw_columns(at(theta, np.zeros(20_000, int)), np.random.default_rng(0))
+    drawn = posterior.draw_coefficients(at(theta, np.zeros(20_000, int)), np.random.default_rng(0))
     mean, cov = Dense(posterior.model, posterior.observations, one).coefficients()
     sd = np.sqrt(np.diag(cov))
     assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(20_000)).all()
@@ -170,7 +170,7 @@ def test_the_plain_program_has_the_density_of_the_equations(name):
         for i in range(20):
             given = {n: jax.numpy.asarray(v[i]) for n, v in values.items()}
             c, start = posterior.prior(at(theta, slice(i, i + 1))).draw(rng)[0], 0
-            for effect in model.columns:
+            for effect in model.terms:
                 mean, parts = effect.prior(at(theta, slice(i, i + 1)), observations)
                 first = start
                 for k, part in enumerate(parts):

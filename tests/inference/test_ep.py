@@ -31,11 +31,11 @@ def by_quadrature(posterior, theta):
     L, e = np.linalg.cholesky(cov), np.linspace(-8.0, 8.0, 801)
     a, b = np.meshgrid(e, e, indexing="ij")
     f = mean[:, None, None] + np.stack([L[0, 0] * a, L[1, 0] * a + L[1, 1] * b])
-    terms, total = posterior.terms, -0.5 * (a**2 + b**2) - np.log(2.0 * np.pi)
+    rates, total = posterior.rates, -0.5 * (a**2 + b**2) - np.log(2.0 * np.pi)
     for k in range(2):
-        if not np.isnan(terms.y[0, k]):
+        if not np.isnan(rates.y[0, k]):
             sd = predictor.noise_sd[0, 0, 0]
-            total = total + terms.likelihood.log_prob(terms.y[0, k], 40.0, f[k], sd)
+            total = total + rates.likelihood.log_prob(rates.y[0, k], 40.0, f[k], sd)
     return logsumexp(total) + 2.0 * np.log(e[1] - e[0])
 
 
@@ -51,7 +51,7 @@ def test_the_evidence_and_the_mean_weight_are_those_of_quadrature(family, y):
     many = at(theta, np.zeros(20_000, int))
     joint = posterior._joint(many)
     sites = ep.Sites(*(np.repeat(s, 20_000, axis=0) for s in posterior.sites)).at(
-        posterior.terms, joint.predictor.noise_sd
+        posterior.rates, joint.predictor.noise_sd
     )
     _, _, log_weight = ep.draw(joint, sites, np.random.default_rng(0))
     weight = np.exp(log_weight - wanted)

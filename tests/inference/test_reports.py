@@ -71,15 +71,15 @@ def test_predictions_are_those_of_the_joint_normal_of_draws():
 
     fitted, draws = read_posterior(posterior)
     observations = fitted.model.observations([new])
-    effects = zip(fitted.model.columns, strict=True)
-    U = np.column_stack([effect.columns(observations).toarray() for (effect,) in effects])
+    effects = zip(fitted.model.terms, strict=True)
+    U = np.column_stack([effect.design(observations).toarray() for (effect,) in effects])
     log_w, means = [], []
     for i in range(len(draws.c)):
         theta = at(draws.theta, slice(i, i + 1))
         predictor = fitted.model.linear_predictor(
             theta, observations, fitted.model.layout(observations)
         )
-        inputs = fitted.model.layout(observations).columns(sparse.csr_array(U)) @ draws.c[i]
+        inputs = fitted.model.layout(observations).design(sparse.csr_array(U)) @ draws.c[i]
         mean = (predictor.mean[0, 0] + predictor.response[0, 0] @ inputs.ravel()).ravel()
         S = predictor.covariance[0, 0]
         C = S[:4, :4] + float(predictor.noise_sd[0].ravel()[0]) ** 2 * np.eye(4)

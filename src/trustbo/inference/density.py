@@ -7,7 +7,7 @@ import numpy as np
 from scipy import sparse
 
 from trustbo.inference import ep, gradient
-from trustbo.inference.engine import Blocks, Fit, Prior, columns_of, evidence
+from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, evidence
 from trustbo.inference.factor import Order
 from trustbo.inference.importance import Student, climb
 from trustbo.models.effects.effect import Theta
@@ -61,7 +61,7 @@ class Draws(NamedTuple):
         return self._replace(theta=at(self.theta, index), c=self.c[index], f=f)
 
 
-class Columns(NamedTuple):
+class Coefficients(NamedTuple):
     """Normal distributions of the coefficients at points, represented by draws."""
 
     mean: np.ndarray  # (point, column)
@@ -92,7 +92,7 @@ class Density:
     """Posterior density of a model's scores, and draws of its coefficients given the scores."""
 
     def __init__(self, model: TrustModel, observations: Observations) -> None:
-        """Prepare the columns and blocks of a model for the observations."""
+        """Prepare the design matrix and blocks of a model for the observations."""
         self.model = model
         self.observations = observations
         self.evaluated: Callable[[int], object] = lambda n: None  # called with numbers of points
@@ -100,9 +100,9 @@ class Density:
         self.scores = model.scores(observations)
         self.n_scores = self.scores.n_scores
 
-        columns = [effect.columns(observations) for effect in model.columns]
-        self.ends = np.cumsum([0, *(U.shape[1] for U in columns)])
-        self._U = self.layout.columns(sparse.hstack(columns, format="csr"))
+        designs = [effect.design(observations) for effect in model.terms]
+        self.ends = np.cumsum([0, *(U.shape[1] for U in designs)])
+        self._U = self.layout.design(sparse.hstack(designs, format="csr"))
         self.exact = model.likelihood.gaussian
         self._chained = self.exact and observations.n_missions >= _CHAINED
 
@@ -111,7 +111,7 @@ class Density:
             y, self._U, self.layout.label, apart=not self.exact, order=self._order()
         )
         if not self.exact:
-            self.terms = ep.Terms(model.likelihood, y, self.layout.rows(observations.n_ticks))
+            self.rates = ep.Rates(model.likelihood, y, self.layout.rows(observations.n_ticks))
             self.reset_ep()
 
     @property
@@ -140,7 +140,7 @@ class Density:
         """Return the density without the data of one mission."""
         other = Density(self.model, self.observations.without([mission]))
         if not self.exact:
-            kept = ~np.isnan(other.terms.y)
+            kept = ~np.isnan(other.rates.y)
             other.sites = ep.Sites(*(np.where(kept, site, 0.0) for site in self.sites))
         return other
 
@@ -159,7 +159,7 @@ class Density:
             log_p[some] = self.log_evidence(theta) + log_prior
         return np.where(np.isfinite(log_p), log_p, -np.inf)
 
-    def visit(self, z: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Columns]:
+    def visit(self, z: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Coefficients]:
         """Compute the log density of scores, and the coefficients there, given Gaussian rates."""
         n_points = len(z)
         n_columns = self._U.shape[1]
@@ -172,10 +172,12 @@ class Density:
             for where, chunk in chunks(theta, self._n_at_once):
                 fit, prior = self._fit(chunk)
                 log_p[some[where]] = fit.log_p
-                mean[some[where]], deviation[some[where]] = columns_of(prior, fit, _DEVIATIONS, rng)
+                mean[some[where]], deviation[some[where]] = coefficients_of(
+                    prior, fit, _DEVIATIONS, rng
+                )
             log_p[some] += log_prior
 
-        return np.where(np.isfinite(log_p), log_p, -np.inf), Columns(mean, deviation)
+        return np.where(np.isfinite(log_p), log_p, -np.inf), Coefficients(mean, deviation)
 
     def _possible(self, z: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
         """Return hyperparameters, log priors and indices where the density may be positive."""
@@ -211,7 +213,7 @@ class Density:
     def reset_ep(self) -> None:
         """Forget the EP sites, so that results do not depend on what was computed before."""
         if not self.exact:
-            self.sites = ep.first_sites(self.terms)
+            self.sites = ep.first_sites(self.rates)
 
     def run_ep(self, theta: Theta) -> None:
         """Find the EP sites at the mean of theta, for use as initial sites at all other points."""
@@ -288,18 +290,18 @@ class Density:
         c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
         return Draws(theta, c, f), log_weight + self.scores.log_prior(z) - log_p
 
-    def draw_columns(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
+    def draw_coefficients(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
         """Draw the coefficients (point, column) once at each point given Gaussian rates."""
         drawn = []
         for _, chunk in chunks(theta):
             fit, prior = self._fit(chunk)
-            mean, deviation = columns_of(prior, fit, 1, rng)
+            mean, deviation = coefficients_of(prior, fit, 1, rng)
             drawn.append(mean + deviation[:, 0])
         return np.concatenate(drawn)
 
     def prior(self, theta: Theta) -> Prior:
         """Return the prior on all coefficients at each theta."""
-        return Prior.of([effect.prior(theta, self.observations) for effect in self.model.columns])
+        return Prior.of([effect.prior(theta, self.observations) for effect in self.model.terms])
 
     def _prior_of_fit(self, theta: Theta) -> Prior:
         """Return the prior in the form that is fastest for computing the evidence."""
@@ -307,7 +309,7 @@ class Density:
         groups = []
         chains = None
         first = 0
-        for effect, start in zip(self.model.columns, self.ends[:-1], strict=True):
+        for effect, start in zip(self.model.terms, self.ends[:-1], strict=True):
             found = None
             if self._chained and chains is None:  # `Order` has one group of hidden columns
                 found = effect.chains(theta, self.observations)
@@ -344,7 +346,7 @@ class Density:
 
     def _joint(self, theta: Theta) -> ep.Joint:
         """Return the blocks, linear predictors, prior and observations for EP at each theta."""
-        return ep.Joint(self.blocks, *self._at(theta), self.terms)
+        return ep.Joint(self.blocks, *self._at(theta), self.rates)
 
 
 def at(theta: Mapping[str, Any], index: Any) -> dict[str, Any]:

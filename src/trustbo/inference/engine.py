@@ -55,7 +55,7 @@ class Blocks(NamedTuple):
 
         Args:
             y: Observations (block, row), NaN where not measured.
-            U: Columns as a sparse matrix (block * input, column).
+            U: Design as a sparse matrix (block * input, column).
             label: Index (block,) of each block on the second axis of a `LinearPredictor`.
             order: Order in which the columns are eliminated.
             apart: Whether each block is a separate kind, as needed if sites differ between blocks.
@@ -303,7 +303,7 @@ def expected(blocks: Blocks, predictor: LinearPredictor, c: Any) -> Any:
     return each(predictor.mean, label) + (predictor.response[:, label] @ drift[..., None])[..., 0]
 
 
-def columns_of(
+def coefficients_of(
     prior: Prior, fit: Fit, n: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return posterior means (point, column) and n deviations (point, n, column) of coefficients.

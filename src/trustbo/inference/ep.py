@@ -35,7 +35,7 @@ _JITTER = 1e-12
 """Added to the covariance of the predictors of a block."""
 
 
-class Terms(NamedTuple):
+class Rates(NamedTuple):
     """Observations of all blocks and their family; each block must be a separate kind."""
 
     likelihood: Family
@@ -54,7 +54,7 @@ class Joint(NamedTuple):
     blocks: Blocks
     predictor: LinearPredictor
     prior: Prior
-    terms: Terms
+    rates: Rates
 
 
 class Sites(NamedTuple):
@@ -69,30 +69,30 @@ class Sites(NamedTuple):
         some = self.lam != 0.0
         return np.where(some, self.eta / np.where(some, self.lam, 1.0), 0.0)
 
-    def at(self, terms: Terms, sd: np.ndarray) -> "Sites":
+    def at(self, rates: Rates, sd: np.ndarray) -> "Sites":
         """Return the sites, with exact values for linear observations given the noise sd."""
-        lam = np.where(terms.linear, sd**-2.0, self.lam)
-        eta = np.where(terms.linear, np.nan_to_num(terms.y) * sd**-2.0, self.eta)
+        lam = np.where(rates.linear, sd**-2.0, self.lam)
+        eta = np.where(rates.linear, np.nan_to_num(rates.y) * sd**-2.0, self.eta)
         return Sites(*np.broadcast_arrays(lam, eta))
 
 
-def first_sites(terms: Terms) -> Sites:
+def first_sites(rates: Rates) -> Sites:
     """Make initial sites (1, block, row), matched under a vague distribution of trust."""
-    unit, zero = terms.likelihood.line_of_sight
-    y = terms.y
+    unit, zero = rates.likelihood.line_of_sight
+    y = rates.y
     m = np.full(y.shape, unit * (0.5 - zero))
     v = np.full(y.shape, (_VAGUE_SD * unit) ** 2)
     noise = np.full(y.shape, _USUAL_NOISE)
 
-    _, mean, var = terms.likelihood.match(y, terms.n_ticks, m, v, noise)
-    return _matched(terms, 1.0 / v[None], m / v, mean, var)
+    _, mean, var = rates.likelihood.match(y, rates.n_ticks, m, v, noise)
+    return _matched(rates, 1.0 / v[None], m / v, mean, var)
 
 
 def _matched(
-    terms: Terms, rest: np.ndarray, slope: np.ndarray, mean: np.ndarray, var: np.ndarray
+    rates: Rates, rest: np.ndarray, slope: np.ndarray, mean: np.ndarray, var: np.ndarray
 ) -> Sites:
     """Find the sites whose products with cavities N(slope / rest, 1 / rest) match mean and var."""
-    seen = ~np.isnan(terms.y)
+    seen = ~np.isnan(rates.y)
     lam = np.where(seen, np.maximum(1.0 / var - rest, _LEAST), 0.0)
     eta = np.where(seen, mean * (lam + rest) - slope, 0.0)
     return Sites(lam, eta)
@@ -105,10 +105,10 @@ def log_evidence(
 
     A sweep updates all sites at once (parallel EP). After the last, only the evidence is computed.
     """
-    blocks, predictor, prior, terms = joint
-    seen = ~np.isnan(terms.y)
+    blocks, predictor, prior, rates = joint
+    seen = ~np.isnan(rates.y)
     sd = predictor.noise_sd
-    sites = sites.at(terms, sd)
+    sites = sites.at(rates, sd)
 
     log_p = np.zeros(len(sd))
     for sweep in range(n_sweeps + 1):
@@ -124,14 +124,14 @@ def log_evidence(
         v = 1.0 / rest
 
         # Moments of the cavity times the likelihood term, and the log evidence (3.57 and 3.65).
-        log_mass, mean, var = terms.likelihood.match(terms.y, terms.n_ticks, m, v, sd)
+        log_mass, mean, var = rates.likelihood.match(rates.y, rates.n_ticks, m, v, sd)
         log_p = fit.log_p + np.where(seen, log_mass - _overlap(y, lam, m, v), 0.0).sum((1, 2))
 
         # The site that gives these moments (3.59), damped.
         if sweep < n_sweeps:
-            new = _matched(terms, rest, slope, mean, np.maximum(var, _LEAST_VARIANCE))
+            new = _matched(rates, rest, slope, mean, np.maximum(var, _LEAST_VARIANCE))
             sites = Sites(lam + damp * (new.lam - lam), eta + damp * (new.eta - eta))
-            sites = sites.at(terms, sd)
+            sites = sites.at(rates, sd)
     return log_p, sites
 
 
@@ -154,14 +154,14 @@ def draw(
         Coefficients (point, column), linear predictors (point, block, row) and log weights
         (point,).
     """
-    blocks, predictor, prior, terms = joint
+    blocks, predictor, prior, rates = joint
     n_points = len(predictor.noise_sd)
     n_columns = blocks.U.shape[1]
     nu = max(_LEAST_DEGREES, 2.0 * n_columns)
 
     proposals = []
     for share in (1.0, _TEMPERED):
-        lam = np.where(terms.linear, 1.0, share) * sites.lam
+        lam = np.where(rates.linear, 1.0, share) * sites.lam
         fit = evidence(blocks, predictor, prior, lam, sites.y)
         center = prior.mean + fit.F.back(fit.half[:, None])[:, 0]
         proposals.append((center, fit.F))
@@ -196,10 +196,10 @@ def draw_predictors(
         Linear predictors (draw, block, row) and log weights (draw, block). The mean weight is the
         likelihood of a block given the coefficients.
     """
-    blocks, predictor, _, terms = joint
+    blocks, predictor, _, rates = joint
     lam, eta = sites
     y = sites.y
-    seen = ~np.isnan(terms.y)
+    seen = ~np.isnan(rates.y)
 
     # Normal distribution of the predictors of a block given its sites.
     W, log_sites = whiten(blocks, predictor, lam)
@@ -224,10 +224,10 @@ def draw_predictors(
         m = (a / d2 - eta[..., k]) / rest
         v = 1.0 / rest
 
-        own, log_mass = terms.likelihood.draw(
-            terms.y[:, k], terms.n_ticks[:, k], m, v, sd[..., k], rng
+        own, log_mass = rates.likelihood.draw(
+            rates.y[:, k], rates.n_ticks[:, k], m, v, sd[..., k], rng
         )
-        is_exact = ~seen[:, k] | terms.linear[:, k]
+        is_exact = ~seen[:, k] | rates.linear[:, k]
         f[..., k] = np.where(is_exact, a + d * rng.standard_normal(a.shape), own)
         e[..., k] = (f[..., k] - a) / d
 

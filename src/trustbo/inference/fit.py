@@ -19,7 +19,7 @@ from trustbo.errors import (
     require_kind,
     require_whole,
 )
-from trustbo.inference.density import SWEEPS, Columns, Density, Draws
+from trustbo.inference.density import SWEEPS, Coefficients, Density, Draws
 from trustbo.inference.importance import (
     MAX_KHAT,
     LogDensity,
@@ -220,17 +220,17 @@ def _exact_draws(
     first: Student | None,
 ) -> tuple[Draws, np.ndarray, dict[str, Any]]:
     """Draw n times given Gaussian rates, for which the log density of scores is exact."""
-    visited: list[Columns] = []
+    visited: list[Coefficients] = []
 
     def visit(z: np.ndarray) -> np.ndarray:
-        log_p, columns = density.visit(z, rng)
-        visited.append(columns)
+        log_p, coefficients = density.visit(z, rng)
+        visited.append(coefficients)
         return log_p
 
     points = _points(density, size, rng, first, visit)
     chosen = points.resample(n, rng)
 
-    c = Columns.joined(visited).draw(chosen, rng)
+    c = Coefficients.joined(visited).draw(chosen, rng)
     drawn = Draws(density.theta(points.z[chosen]), c)
 
     summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}

@@ -117,7 +117,7 @@ def _ep_trust(
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw trust given non-Gaussian rates by weighted particles; returns as `_exact_trust`."""
-    joint = ep.Joint(density.blocks, predictor, density.prior(theta), density.terms)
+    joint = ep.Joint(density.blocks, predictor, density.prior(theta), density.rates)
     _, sites = ep.log_evidence(joint, density.sites, SWEEPS)
 
     # Particles of the predictor f; the Gumbel noise chooses one by weight, for each block.

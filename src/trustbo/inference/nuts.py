@@ -178,11 +178,11 @@ def sample_by_nuts(
         stats["lp"] = stats["lp"] - log_jacobian
         values = density.scores.values(z)
         theta = density.model.theta(values, resolution)
-        drawn = Draws(theta, density.draw_columns(theta, rng))
+        drawn = Draws(theta, density.draw_coefficients(theta, rng))
     else:
         values = {name: samples[name] for name in density.scores.priors}
         theta = density.model.theta(values, resolution)
-        drawn = Draws(theta, samples["columns"], samples["linear_predictor"])
+        drawn = Draws(theta, samples["coefficients"], samples["linear_predictor"])
 
     by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
     found, complaints = complaints_of(by_chain, stats["diverging"])

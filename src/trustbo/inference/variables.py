@@ -14,7 +14,7 @@ def named(density: Density, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
     theta = draws.theta
     groups = {"posterior": _hyperparameters(density, theta)}
     ends = zip(density.ends[:-1], density.ends[1:], strict=True)
-    for effect, (start, end) in zip(density.model.columns, ends, strict=True):
+    for effect, (start, end) in zip(density.model.terms, ends, strict=True):
         of_effect = effect.named(draws.c[:, start:end], theta, density.observations)
         groups.setdefault(effect.group or "posterior", {}).update(of_effect)
     return groups
@@ -29,7 +29,7 @@ def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -
 
     c = [
         effect.coefficients(groups[effect.group or "posterior"], theta, density.observations)
-        for effect in model.columns
+        for effect in model.terms
     ]
     return Draws(theta, np.column_stack(c))
 

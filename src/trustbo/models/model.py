@@ -16,7 +16,7 @@ from trustbo.data import Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import Renamed, TrustboError, require_choice, require_list
 from trustbo.models.contact_rate import ContactRate
-from trustbo.models.effects.effect import Effect, Theta, sample_columns
+from trustbo.models.effects.effect import Effect, Theta, sample_coefficients
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.observations import Observations, require_ticks
@@ -153,8 +153,8 @@ class TrustModel(Summary, ABC):
         return LinearPredictor.of(space, layout, self.random_effects(theta, observations))
 
     @property
-    def columns(self) -> tuple[Effect, ...]:
-        """Feature weights and effects, in the order of their columns."""
+    def terms(self) -> tuple[Effect, ...]:
+        """Feature weights and effects, in the order of their columns in the design matrix."""
         return self.weights, *self.effects
 
     @property
@@ -244,10 +244,9 @@ class TrustModel(Summary, ABC):
         values = {name: jnp.asarray(value)[None] for name, value in values.items()}
         theta: Any = self.theta(values, observations.resolution)
 
-        c: Any = numpyro.deterministic("columns", sample_columns(self.columns, theta, observations))
-        U: Any = sparse.hstack(
-            [effect.columns(observations) for effect in self.columns], format="csr"
-        )
+        drawn = sample_coefficients(self.terms, theta, observations)
+        c: Any = numpyro.deterministic("coefficients", drawn)
+        U: Any = sparse.hstack([effect.design(observations) for effect in self.terms], format="csr")
 
         if self.likelihood.gaussian:
             carried = np.broadcast_to(self.carried(observations), U.shape[1:])
@@ -263,7 +262,7 @@ class TrustModel(Summary, ABC):
 
         layout = self.layout(observations, contrasts=False)
         predictor: Any = self.linear_predictor(theta, observations, layout)
-        u = (layout.columns(U).toarray() @ c).reshape(len(layout.label), -1)
+        u = (layout.design(U).toarray() @ c).reshape(len(layout.label), -1)
         y = layout.rows(observations.contact_rate)
         ticks = layout.rows(observations.n_ticks)
 

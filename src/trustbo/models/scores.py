@@ -88,7 +88,7 @@ class NormalScores:
         return np.concatenate([np.arange(self.n_scores)[self.at[name]] for name in names])
 
     @cached_property
-    def terms(self) -> np.ndarray:
+    def cubics(self) -> np.ndarray:
         """Coefficients (power, interval, score) of splines through the quantiles of the priors."""
         knots = np.linspace(-_FARTHEST, _FARTHEST, _N_KNOTS)
         columns = []
@@ -120,7 +120,7 @@ class NormalScores:
         at = self.at[name]
         if namespace(z) is np:
             return quantile(self.priors[name], z[:, at], name)
-        return _interpolated(self.terms[:, :, at], z[:, at])
+        return _interpolated(self.cubics[:, :, at], z[:, at])
 
     def _factor(self, pair: Pair, z: Any) -> Any:
         """Return the factor (point, 1) of the first standard deviation of a pair."""
@@ -200,18 +200,18 @@ def quantile(prior: Distribution, score: np.ndarray, name: str) -> np.ndarray:
     return _by_numpyro(prior, special.ndtr(score), name)
 
 
-def _interpolated(terms: np.ndarray, score: jax.Array) -> jax.Array:
+def _interpolated(cubics: np.ndarray, score: jax.Array) -> jax.Array:
     """Interpolate quantiles in JAX, which lacks the quantiles of some distributions.
 
     Args:
-        terms: Coefficients of cubic polynomials (power, interval, score); see `NormalScores.terms`.
+        cubics: Coefficients of polynomials (power, interval, score); see `NormalScores.cubics`.
         score: NormalScores (point, score).
     """
     step = 2.0 * _FARTHEST / (_N_KNOTS - 1)
     interval = jnp.clip(jnp.floor((score + _FARTHEST) / step), 0, _N_KNOTS - 2).astype(int)
     x = score + _FARTHEST - step * interval
 
-    a, b, c, d = jnp.asarray(terms)[:, interval, np.arange(score.shape[1])]
+    a, b, c, d = jnp.asarray(cubics)[:, interval, np.arange(score.shape[1])]
     return ((a * x + b) * x + c) * x + d
 
 

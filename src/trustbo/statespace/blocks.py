@@ -92,7 +92,7 @@ class Layout(NamedTuple):
         values = np.swapaxes(values, -1, -2)
         return values if self.rotation is None else values @ self.rotation
 
-    def columns(self, U: Any) -> Any:
+    def design(self, U: Any) -> Any:
         """Rearrange a sparse design matrix (observation, column) to (block * input, column).
 
         If only some columns are carried over, each block has first their inputs in all rows, and

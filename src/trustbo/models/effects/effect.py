@@ -77,8 +77,11 @@ class Effect:
                 number = require_positive(f"{type(self).__name__}.{name}", value)
                 object.__setattr__(self, name, number)
 
-    def columns(self, observations: Observations) -> Any:
-        """Return a sparse matrix (observation, column), with flattened (mission, bound, robot)."""
+    def design(self, observations: Observations) -> Any:
+        """Return the design matrix (observation, column), which is sparse.
+
+        An observation is a (mission, bound, robot), flattened.
+        """
         raise NotImplementedError
 
     def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
@@ -131,13 +134,13 @@ class Effect:
     def add_data(
         self, observations: Observations, missions: Sequence[Mission], on: Workspace | None
     ) -> Observations:
-        """Add the data that the columns need; `on` is the workspace, if known."""
+        """Add the data that `design` needs; `on` is the workspace, if known."""
         return observations
 
 
-def sample_columns(effects: Sequence[Effect], theta: Theta, observations: Observations) -> Any:
+def sample_coefficients(effects: Sequence[Effect], theta: Theta, observations: Observations) -> Any:
     """Sample all coefficients (column,) at one point theta within a NumPyro program."""
-    columns = []
+    coefficients = []
     for effect in effects:
         mean, parts = effect.prior(theta, observations)
         label = effect.group or "weights"
@@ -146,7 +149,7 @@ def sample_columns(effects: Sequence[Effect], theta: Theta, observations: Observ
             Q = part[0] if part.ndim == 3 else namespace(part).diag(part[0])
             white = dist.MultivariateNormal(np.zeros(len(Q)), precision_matrix=Q)
             c: Any = numpyro.sample(f"{label}_{i}", white)
-            columns.append(c if mean is None else c + mean[0, start : start + len(Q)])
+            coefficients.append(c if mean is None else c + mean[0, start : start + len(Q)])
             start += len(Q)
 
-    return jnp.concatenate(columns)
+    return jnp.concatenate(coefficients)

@@ -72,7 +72,7 @@ class PlaceEffect(Effect):
         bounds = bounds_of(missions, observations.contact_rate.shape[:2])
         return observations._replace(visited=visited(bounds, shape))
 
-    def columns(self, observations: Observations) -> Any:
+    def design(self, observations: Observations) -> Any:
         """Return indicator columns of the cells entered and of the directed bounds."""
         places: Any = observations.visited
         at = np.broadcast_to(places.at[..., None], observations.contact_rate.shape).ravel()

@@ -48,7 +48,7 @@ class RobotEffect(Effect):
         super().__post_init__()
         object.__setattr__(self, "rho", require_share("RobotEffect.rho", self.rho, ends=False))
 
-    def columns(self, observations: Observations) -> Any:
+    def design(self, observations: Observations) -> Any:
         """Return line of sight in one column per robot and mission; the mission varies fastest."""
         n_missions = observations.n_missions
         n_robots = observations.n_robots

@@ -18,7 +18,7 @@ class Weights(Effect):
 
     priors: Priors
 
-    def columns(self, observations: Observations) -> Any:
+    def design(self, observations: Observations) -> Any:
         """Return the features and a column of ones."""
         return sparse.csr_array(_inputs(observations))
 
@@ -48,7 +48,7 @@ class Weights(Effect):
 class RobotWeights(Weights):
     """Separate coefficients N(mu, tau^2) for each robot; the hyperparameter tau is in theta."""
 
-    def columns(self, observations: Observations) -> Any:
+    def design(self, observations: Observations) -> Any:
         """Return the features and a constant 1 for each robot; the robot varies fastest."""
         values = _inputs(observations)
         mine = np.tile(np.eye(observations.n_robots), (len(values) // observations.n_robots, 1))
@@ -92,7 +92,7 @@ class RobotWeights(Weights):
 class CoupledWeights(Weights):
     """Matrices B_m that weight feature m of robot l in the trust of robot i, and intercepts b_i."""
 
-    def columns(self, observations: Observations) -> Any:
+    def design(self, observations: Observations) -> Any:
         """Return the features of all robots and a constant 1, for each robot."""
         n = observations.n_robots
         inputs = observations.awareness.reshape(
