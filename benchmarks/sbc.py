@@ -25,7 +25,7 @@ from trustbo.inference.density import Density
 from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT
 from trustbo.inference.latent import replicate
-from trustbo.inference.variables import draw_prior, named
+from trustbo.inference.variables import draw_prior, to_variables
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -101,7 +101,7 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
         posterior = Density(model, observations._replace(contact_rate=rates))
         drawn, _, summary = by_importance(posterior, n_ranked, int(rng.integers(2**31)))
         if summary["k_hat"] <= MAX_KHAT:
-            found, true = (numbers(named(posterior, d)) for d in (drawn, truth))
+            found, true = (numbers(to_variables(posterior, d)) for d in (drawn, truth))
             ranks.append({name: int((found[name] < true[name][0]).sum()) for name in found})
     return pd.DataFrame(ranks), n - len(ranks)
 

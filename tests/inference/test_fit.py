@@ -15,7 +15,7 @@ from trustbo.inference import add_latent, fit, importance, params_of, sample_pri
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.draws import prior_mean, read_posterior
 from trustbo.inference.tree import parameters_alone
-from trustbo.inference.variables import named
+from trustbo.inference.variables import to_variables
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -99,7 +99,7 @@ def test_any_model_has_any_effects_and_is_read_back_as_it_was(name):
     missions = walking_missions(0, 3)
     posterior = fit(missions, MODELS[name], check=False, **QUIET)
     fitted, draws = read_posterior(posterior)
-    by_name = named(fitted, draws)["posterior"]
+    by_name = to_variables(fitted, draws)["posterior"]
     for site, values in by_name.items():
         if not site.startswith("mean_"):
             kept = posterior["posterior"][site].values

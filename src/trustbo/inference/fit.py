@@ -31,7 +31,7 @@ from trustbo.inference.importance import (
 )
 from trustbo.inference.place_maps import place_group
 from trustbo.inference.tree import N_PRIOR, to_datatree, with_latent
-from trustbo.inference.variables import draws_of, named, prior_parameters
+from trustbo.inference.variables import draws_of, prior_parameters, to_variables
 from trustbo.models.backend import VERSIONS
 from trustbo.models.default import default_model
 from trustbo.models.model import TrustModel
@@ -166,7 +166,7 @@ def fit(
             density, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
         )
 
-    variables = named(density, drawn)
+    variables = to_variables(density, drawn)
     tree = _laid_out(density, variables, stats, (chains, draws), missions, seed)
     if "proposal" in summary:
         tree["sample_stats"].attrs["proposal"] = summary.pop("proposal")

@@ -9,19 +9,19 @@ from trustbo.inference.engine import Prior
 from trustbo.models.effects.effect import Theta
 
 
-def named(density: Density, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
+def to_variables(density: Density, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
     """Return the variables of draws by group (`posterior` and one per effect) and name."""
     theta = draws.theta
     groups = {"posterior": _hyperparameters(density, theta)}
     ends = zip(density.ends[:-1], density.ends[1:], strict=True)
     for effect, (start, end) in zip(density.model.terms, ends, strict=True):
-        of_effect = effect.named(draws.c[:, start:end], theta, density.observations)
+        of_effect = effect.to_variables(draws.c[:, start:end], theta, density.observations)
         groups.setdefault(effect.group or "posterior", {}).update(of_effect)
     return groups
 
 
 def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:
-    """Make draws from variables by group and name, as returned by `named`."""
+    """Make draws from variables by group and name, as returned by `to_variables`."""
     sites = groups["posterior"]
     model = density.model
     theta = model.derived({n: sites[n] for n in model.dims | model.effect_dims if n in sites})
@@ -54,7 +54,10 @@ def prior_parameters(
 
     weights = Prior.of([model.weights.prior(theta, observations)])
     c = weights.mean if even else weights.draw(rng)
-    return {**_hyperparameters(density, theta), **model.weights.named(c, theta, observations)}
+    return {
+        **_hyperparameters(density, theta),
+        **model.weights.to_variables(c, theta, observations),
+    }
 
 
 def _hyperparameters(density: Density, theta: Theta) -> dict[str, np.ndarray]:

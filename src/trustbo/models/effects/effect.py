@@ -100,12 +100,12 @@ class Effect:
         """
         return None
 
-    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
+    def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Convert coefficients c (draw, column) to variables by name."""
         raise NotImplementedError
 
     def coefficients(self, values: Values, theta: Theta, observations: Observations) -> np.ndarray:
-        """Convert variables back to coefficients (draw, column), as the inverse of `named`."""
+        """Convert variables back to coefficients (draw, column), as the inverse of `to_variables`."""
         raise NotImplementedError
 
     def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:

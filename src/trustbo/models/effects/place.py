@@ -105,7 +105,7 @@ class PlaceEffect(Effect):
         tau = xp.maximum(theta["tau_s"], LEAST)[:, None, None]
         return inverse(tau**2 * (K + _JITTER * np.eye(len(square))))
 
-    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
+    def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return the effects `place` (draw, cell) and `place_bound` (draw, bound)."""
         places: Any = observations.visited
         n = len(places.cells)

@@ -76,7 +76,7 @@ class RobotEffect(Effect):
         inverse_gain = theta["inverse_gain"].reshape(len(slow), -1) * np.ones(observations.n_robots)
         return Chains(1.0 / (mission * inverse_gain**2), 1.0 / (slow * inverse_gain**2), self.rho)
 
-    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
+    def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return `robot_effect` (draw, mission, robot), the effects d on stationary trust."""
         d = c.reshape(len(c), observations.n_robots, observations.n_missions) / _inverse_gain(theta)
         return {"robot_effect": np.swapaxes(d, 1, 2)}

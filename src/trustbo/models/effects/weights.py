@@ -35,7 +35,7 @@ class Weights(Effect):
             inverse_gain = 0.0 * inverse_gain + 1.0  # ones, in NumPy or JAX
         return inverse_gain * mean, inverse_gain * sd
 
-    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
+    def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return the weights `beta` (draw, feature) and the intercept `b` (draw,)."""
         return {"beta": c[:, :-1], "b": c[:, -1]}
 
@@ -68,7 +68,7 @@ class RobotWeights(Weights):
         ]
         return namespace(mean).repeat(mean, n, axis=1), parts
 
-    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
+    def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return the weights `beta` (draw, robot, feature), intercepts `b` (draw, robot) and means.
 
         The means `mean_beta` and `mean_b` are expected values given the coefficients.
@@ -117,7 +117,7 @@ class CoupledWeights(Weights):
         sds = xp.where(own, sd[..., feature], coupling_sd)
         return means.reshape(len(means), -1), [sds.reshape(len(sds), -1) ** -2.0]
 
-    def named(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
+    def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return matrices `B` (draw, feature, robot, robot') and intercepts `b` (draw, robot)."""
         n = observations.n_robots
         c = c.reshape(len(c), n, -1)
