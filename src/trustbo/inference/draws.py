@@ -190,7 +190,8 @@ def _robot_effects_ahead(
     n_robots = posterior.attrs["n_robots"]
     n_missions = posterior.attrs["n_missions"]
     slopes = [
-        effect.ahead(values_of(posterior, effect), theta, n_missions, rng) for effect in effects
+        effect.predict_next(values_of(posterior, effect), theta, n_missions, rng)
+        for effect in effects
     ]
     slope = np.broadcast_to(sum(slopes), (n_draws, n_robots))
 

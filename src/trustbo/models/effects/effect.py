@@ -105,10 +105,12 @@ class Effect:
         raise NotImplementedError
 
     def coefficients(self, values: Values, theta: Theta, observations: Observations) -> np.ndarray:
-        """Convert variables back to coefficients (draw, column), as the inverse of `to_variables`."""
+        """Convert variables back to coefficients (draw, column); the inverse of `to_variables`."""
         raise NotImplementedError
 
-    def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
+    def predict_next(
+        self, values: Values, theta: Theta, n: int, rng: Generator | None
+    ) -> np.ndarray:
         """Return the effect (draw, robot) on drift per unit of line of sight after n missions.
 
         The effect is drawn if `rng` is given, otherwise expected. By default, the effect is 0.

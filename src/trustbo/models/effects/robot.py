@@ -86,8 +86,10 @@ class RobotEffect(Effect):
         d = np.swapaxes(values["robot_effect"], 1, 2) * _inverse_gain(theta)
         return d.reshape(len(d), -1)
 
-    def ahead(self, values: Values, theta: Theta, n: int, rng: Generator | None) -> np.ndarray:
-        """See `Effect.ahead`; the next effect d is drawn given d in all n missions."""
+    def predict_next(
+        self, values: Values, theta: Theta, n: int, rng: Generator | None
+    ) -> np.ndarray:
+        """See `Effect.predict_next`; the next effect d is drawn given d in all n missions."""
         C = self._covariance(theta, n)
         slow = np.maximum(theta["tau_slow"], LEAST) ** 2
         k = slow[:, None] * self.rho ** np.arange(n, 0, -1)  # covariance of the next d with the n
