@@ -64,7 +64,7 @@ def test_the_unrolled_graph_has_every_admissible_path(workspace, max_bounds):
     assert nx.is_directed_acyclic_graph(graph)
     found = set()
     for s in paths.graph.starts.tolist():
-        start = (None, int(paths.graph.cell[s]), int(paths.graph.left[s]))
+        start = (None, int(paths.graph.cell[s]), int(paths.graph.n_bounds_left[s]))
         for nodes in nx.all_simple_paths(graph, start, "goal"):
             cells = np.array([node[1] for node in nodes[:-1]])
             found.add((*paths.cells(cells), paths.goal))

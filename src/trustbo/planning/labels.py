@@ -50,10 +50,11 @@ class Costs(NamedTuple):
     """Costs of paths for one draw.
 
     `loss` is a value of `LOSSES`. A bound costs its loss plus `bound_cost` (bound,) minus `weight`
-    (left, robot) times `drift` (robot, bound). `start` (left,) is the constant cost of paths with a
-    given number of bounds. `transition` (robot, robot) and `x0` (robot,) define the recursion for
-    trust, or are empty if there is no loss. `sd` is the sd of a rate. `risk` has the shape (bound,
-    sum), `failure` (sum,) contains F_m, and `limit` is the largest value allowed for the last sum.
+    (n_bounds_left, robot) times `drift` (robot, bound). `start` (n_bounds_left,) is the constant
+    cost of paths with a given number of bounds. `transition` (robot, robot) and `x0` (robot,)
+    define the recursion for trust, or are empty if there is no loss. `sd` is the sd of a rate.
+    `risk` has the shape (bound, sum), `failure` (sum,) contains F_m, and `limit` is the largest
+    value allowed for the last sum.
     """
 
     loss: int
@@ -84,7 +85,7 @@ def best_labels(
         cell indices, padded with -1. A cost is inf if no path is within the limit.
     """
     searches = [graph]
-    divisor = scale[graph.left[graph.starts]]
+    divisor = scale[graph.n_bounds_left[graph.starts]]
     if not (divisor == divisor[0]).all():  # one search for each number of bounds
         searches = [graph._replace(starts=graph.starts[k : k + 1]) for k in range(len(divisor))]
 
@@ -207,7 +208,7 @@ def _try_paths(graph, costs, edge_cost, to_go, known):
     sums = np.empty(len(costs.failure))
 
     for s in graph.starts:
-        cost = costs.start[graph.left[s]]
+        cost = costs.start[graph.n_bounds_left[s]]
         value = cost + to_go.least[s]
         if value == np.inf:
             continue
@@ -423,7 +424,7 @@ def _search(graph, costs, max_labels, edge_cost, limits, known):
         labels.before[n] = -1
         labels.last[s] = n
         labels.number[n] = 0.0
-        labels.number[n, 0] = costs.start[graph.left[s]]
+        labels.number[n, 0] = costs.start[graph.n_bounds_left[s]]
         labels.number[n, 1 + len(costs.failure) :] = costs.x0
         n += 1
 

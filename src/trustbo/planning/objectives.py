@@ -62,7 +62,7 @@ class Weights(NamedTuple):
     """Weights of the drifts of bounds in the score of a path, if the score is a sum over bounds."""
 
     per_bound: Array
-    """Weight w_j of a bound with j bounds left after it, shape (draw, left, state)."""
+    """Weight w_j of a bound with j bounds left after it, shape (draw, n_bounds_left, state)."""
     constant: Array
     """Term of the score that depends only on the number of bounds, shape (draw, length)."""
     scale: Array
@@ -93,7 +93,7 @@ def weights_of(objective: Objective, recursion: Recursion, view: Array, longest:
     of_start[:, 0] = 0.0  # trust counts only after a bound
 
     credit = objective.credit(n)
-    lags = np.tril(credit[n[:, None] - n])  # (left, lag): credit(left - lag)
+    lags = np.tril(credit[n[:, None] - n])  # (n_bounds_left, lag): credit(n_bounds_left - lag)
     constant = of_start @ lags.T
     if objective.of_contact:  # lost contact is one minus the contact rate of each bound
         constant = constant - n

@@ -145,22 +145,24 @@ class AdmissiblePaths:
                 "Give a smaller max_bounds."
             )
 
-        # List the states by cell, where the states of a cell begin at `base`, then sort by `left`.
+        # List the states by cell, where the states of a cell begin at `base`, then sort by
+        # `n_bounds_left`.
         cell = np.repeat(np.arange(rows * cols, dtype=np.int32), n_left)
         base = np.concatenate([[0], np.cumsum(n_left)])
-        left = (np.arange(n_states) - base[cell] + far[cell]).astype(np.int32)
-        order = np.argsort(left, kind="stable")
+        n_bounds_left = (np.arange(n_states) - base[cell] + far[cell]).astype(np.int32)
+        order = np.argsort(n_bounds_left, kind="stable")
         rank = np.empty(n_states, np.int32)
         rank[order] = np.arange(n_states)
         cell = cell[order]
-        left = left[order]
+        n_bounds_left = n_bounds_left[order]
 
         # Find the state to which each move leads from each state; -1 if there is no such state.
         head = np.full((n_states, n_moves), -1, np.int32)
         for m, step in enumerate(STEPS @ (cols, 1)):  # no bound enters a cell across a border
-            tail = np.flatnonzero((cell + step >= 0) & (cell + step < rows * cols) & (left > 0))
+            is_inside = (cell + step >= 0) & (cell + step < rows * cols)
+            tail = np.flatnonzero(is_inside & (n_bounds_left > 0))
             other = cell[tail] + step
-            more = left[tail] - 1 - far[other]  # bounds left after the move, minus the fewest
+            more = n_bounds_left[tail] - 1 - far[other]  # bounds left, minus the fewest
             fits = bounds[m, other] & (more >= 0) & (more < n_left[other])
             head[tail[fits], m] = rank[base[other[fits]] + more[fits]]
 
@@ -172,7 +174,7 @@ class AdmissiblePaths:
 
         start = np.flatnonzero(near == 0)[0]
         starts = rank[base[start] : base[start + 1]]
-        return Unrolled(cell, left, first, head, bound, starts, self.turns)
+        return Unrolled(cell, n_bounds_left, first, head, bound, starts, self.turns)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
         """Return the paths that avoid the given bounds.

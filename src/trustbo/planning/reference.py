@@ -69,14 +69,15 @@ def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cel
 
     drift = recursion.drift.reshape(n_states, -1)
     bound_cost = problem.bound_cost.ravel()
-    left = graph.left[graph.head]  # bounds left after each edge
+    n_bounds_left = graph.n_bounds_left[graph.head]  # bounds left after each edge
     cost = [
-        bound_cost[b] - weights[j] @ drift[:, b] for b, j in zip(graph.bound, left, strict=True)
+        bound_cost[b] - weights[j] @ drift[:, b]
+        for b, j in zip(graph.bound, n_bounds_left, strict=True)
     ]
     network = graph.to_networkx(cost)
 
     for s in graph.starts:
-        start = None, int(graph.cell[s]), int(graph.left[s])
+        start = None, int(graph.cell[s]), int(graph.n_bounds_left[s])
         try:
             nodes = nx.bellman_ford_path(network, start, "goal", weight="cost")
         except (nx.NetworkXNoPath, nx.NodeNotFound):  # every path of this length has a U-turn

@@ -50,7 +50,8 @@ def _best_sums(graph, drift, per_bound, constant, scale, bound_cost, scores, pat
 
         chosen = -1
         for s in graph.starts:
-            score = (constant[d, graph.left[s]] - to_go.least[s]) / scale[graph.left[s]]
+            n_bounds_left = graph.n_bounds_left[s]
+            score = (constant[d, n_bounds_left] - to_go.least[s]) / scale[n_bounds_left]
             if score > scores[d]:
                 scores[d] = score
                 chosen = s
@@ -66,8 +67,8 @@ def _best_sums(graph, drift, per_bound, constant, scale, bound_cost, scores, pat
 def costs_of_sums(graph, drift, per_bound, bound_cost, cost) -> None:
     """Write the cost of each edge for one draw to `cost`: that of its bound minus w_j . u."""
     for e in range(len(graph.head)):
-        left = graph.left[graph.head[e]]
+        n_bounds_left = graph.n_bounds_left[graph.head[e]]
         b = graph.bound[e]
         cost[e] = bound_cost[b]
         for i in range(len(drift)):
-            cost[e] -= per_bound[left, i] * drift[i, b]
+            cost[e] -= per_bound[n_bounds_left, i] * drift[i, b]

@@ -1,9 +1,9 @@
 """Unrolled graph, which contains a copy of each cell and bound for each number of bounds left.
 
-A state (cell, left) is a cell from which exactly `left` bounds remain. Each edge is a bound, and
-leads to a state with one bound fewer left. Paths through the graph are the admissible paths, except
-that U-turns must be excluded if they are forbidden. Compiled kernels process the states in order of
-`left`, and `to_networkx` exports the same edges.
+A state (cell, n_bounds_left) is a cell from which exactly `n_bounds_left` bounds remain. Each edge
+is a bound, and leads to a state with one bound fewer left. Paths through the graph are the
+admissible paths, except that U-turns must be excluded if they are forbidden. Compiled kernels
+process the states in order of `n_bounds_left`, and `to_networkx` exports the same edges.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ class Unrolled(NamedTuple):
 
     Attributes:
         cell: Flat index of the cell of each state, shape (state,).
-        left: Number of bounds left in each state, shape (state,); state 0 is the goal.
+        n_bounds_left: Number of bounds left in each state, shape (state,); state 0 is the goal.
         first: Index of the first edge that leaves each state, then the number of edges.
         head: State to which each edge leads, shape (edge,).
         bound: Flat index move * cells + cell of the bound of each edge, shape (edge,).
@@ -32,7 +32,7 @@ class Unrolled(NamedTuple):
     """
 
     cell: np.ndarray
-    left: np.ndarray
+    n_bounds_left: np.ndarray
     first: np.ndarray
     head: np.ndarray
     bound: np.ndarray
@@ -42,14 +42,14 @@ class Unrolled(NamedTuple):
     @property
     def longest(self) -> int:
         """Largest number of bounds of a path."""
-        return int(self.left[-1])
+        return int(self.n_bounds_left[-1])
 
     def to_networkx(self, cost: Sequence[float] | np.ndarray) -> nx.DiGraph:
         """Return a networkx graph with the `cost` and the `bound` of each edge.
 
-        Every path from a node `(None, start, left)` to the node `"goal"` is admissible. Each other
-        node is a tuple (previous cell, cell, bounds left). If U-turns are allowed, the previous
-        cell is not needed and is None.
+        Every path from a node `(None, start, n_bounds_left)` to the node `"goal"` is admissible.
+        Each other node is a tuple (previous cell, cell, bounds left). If U-turns are allowed, the
+        previous cell is not needed and is None.
 
         Args:
             cost: Cost of each edge, shape (edge,).
@@ -60,14 +60,16 @@ class Unrolled(NamedTuple):
 
         while nodes:
             before, s = nodes.pop()
-            tail = (before, int(self.cell[s]), int(self.left[s]))
+            tail = (before, int(self.cell[s]), int(self.n_bounds_left[s]))
             for e in range(self.first[s], self.first[s + 1]):
                 h = int(self.head[e])
                 if not self.turns and self.cell[h] == before:
                     continue
 
                 onward = (None if self.turns else tail[1], h)
-                head = "goal" if h == 0 else (onward[0], int(self.cell[h]), int(self.left[h]))
+                head = "goal"
+                if h != 0:
+                    head = onward[0], int(self.cell[h]), int(self.n_bounds_left[h])
                 graph.add_edge(tail, head, cost=float(cost[e]), bound=int(self.bound[e]))
                 if h > 0 and onward not in met:
                     met.add(onward)
