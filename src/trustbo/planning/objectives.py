@@ -69,23 +69,27 @@ class Weights(NamedTuple):
     """Divisor of the sum over the bounds of a path, shape (length,)."""
 
 
-def weights_of(objective: Objective, recursion: Recursion, view: Array, longest: int) -> Weights:
+def weights_of(
+    objective: Objective, recursion: Recursion, state_weights: Array, longest: int
+) -> Weights:
     """Compute the weights of the drifts in the score of paths of up to `longest` bounds.
 
     The recursion unrolls to x_k = B0^k x_0 + sum_{i <= k} B0^(k - i) u_i, and the team's trust is
-    view . x. Therefore, w_j = sum_{i <= j} credit(i) view . B0^(j - i) for a bound with j bounds
-    left after it. In a path of K bounds, x_0 adds sum_{1 <= k <= K} credit(K - k) view . B0^k x_0.
+    s . x, where s are the `state_weights`. Therefore, w_j = sum_{i <= j} credit(i) s . B0^(j - i)
+    for a bound with j bounds left after it. In a path of K bounds, x_0 adds
+    sum_{1 <= k <= K} credit(K - k) s . B0^k x_0.
 
     Args:
         objective: One of the objectives in `OBJECTIVES`. For lost_contact, the expected contact
             rate is assumed to equal trust.
         recursion: Recursion for trust, with leading axis (draw,).
-        view: Weights of the states in the team's trust, shape (state,).
+        state_weights: Weights of the states in the team's trust, shape (state,).
         longest: Largest number of bounds of a path.
     """
     n = np.arange(longest + 1)
-    powers = np.empty((len(recursion.start), longest + 1, len(view)))  # view . B0^k
-    powers[:, 0] = view
+    n_draws = len(recursion.start)
+    powers = np.empty((n_draws, longest + 1, len(state_weights)))  # s . B0^k
+    powers[:, 0] = state_weights
     for k in range(longest):
         powers[:, k + 1] = np.einsum("ds,dst->dt", powers[:, k], recursion.transition)
 

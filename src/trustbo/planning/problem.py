@@ -205,8 +205,8 @@ class Problem:
         n_draws, n_states = recursion.start.shape
         drift = recursion.drift.reshape(n_draws, n_states, -1)
         bound_cost = self.bound_cost.ravel()
-        view = np.full(n_states, 1.0 / n_states)
-        weights = weights_of(self.objective, recursion, view, graph.longest)
+        state_weights = np.full(n_states, 1.0 / n_states)
+        weights = weights_of(self.objective, recursion, state_weights, graph.longest)
 
         if self.risks is None and not history:
             score, paths = best_sums(graph, drift, weights, bound_cost)

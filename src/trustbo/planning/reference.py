@@ -53,18 +53,18 @@ def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cel
     """Find the best path for each number of bounds with `networkx.bellman_ford_path`.
 
     A bound with drift u and j bounds left after it adds w_j . u minus its cost to the value. Here,
-    w_j = sum_{i <= j} credit(i) view . B0^(j - i), and view . x is the team's mean trust.
+    w_j = sum_{i <= j} credit(i) s . B0^(j - i), where s . x is the team's mean trust.
     """
     problem = planner.problem
     graph = problem.paths.graph
     n_states = len(recursion.start)
-    view = np.full(n_states, 1.0 / n_states)
+    state_weights = np.full(n_states, 1.0 / n_states)
     credit = problem.objective.credit(np.arange(graph.longest + 1))
 
     weights = []
     carried = np.zeros(n_states)
     for j in range(graph.longest):
-        carried = carried @ recursion.transition + credit[j] * view
+        carried = carried @ recursion.transition + credit[j] * state_weights
         weights.append(carried)
 
     drift = recursion.drift.reshape(n_states, -1)

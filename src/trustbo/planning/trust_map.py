@@ -22,7 +22,7 @@ def trust_map(
     n_states = recursion.start.shape[-1]
 
     if per_robot:
-        robots = [_largest(problem.paths, recursion, view) for view in np.eye(n_states)]
+        robots = [_largest(problem.paths, recursion, of_one) for of_one in np.eye(n_states)]
         values = np.stack(robots, axis=1)
     else:
         values = _largest(problem.paths, recursion, np.full(n_states, 1.0 / n_states))
@@ -41,17 +41,18 @@ def cost_of(trust: xr.DataArray) -> xr.DataArray:
     return cost.assign_attrs(long_name="cost 1 - sigma(trust)")
 
 
-def _largest(paths: AdmissiblePaths, recursion: Recursion, view: np.ndarray) -> np.ndarray:
-    """Compute the largest trust, view . x, on arrival at each cell, (draw, row, col)."""
+def _largest(paths: AdmissiblePaths, recursion: Recursion, state_weights: np.ndarray) -> np.ndarray:
+    """Compute the largest trust, state_weights . x, on arrival at each cell, (draw, row, col)."""
     extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
 
-    weights = view @ recursion.transition  # (draw, state)
-    beta0 = np.divide(weights, view, out=np.zeros_like(weights), where=view > 0.0)
-    scalar = (weights == beta0.max(-1, keepdims=True) * view).all()  # view . x has a recursion
+    weights = state_weights @ recursion.transition  # (draw, state)
+    beta0 = np.divide(weights, state_weights, out=np.zeros_like(weights), where=state_weights > 0.0)
+    # Whether the scalar state_weights . x has a recursion of its own.
+    scalar = (weights == beta0.max(-1, keepdims=True) * state_weights).all()
     if scalar and (beta0 >= 0.0).all():
-        drift = np.einsum("s,dsmrc->dmrc", view, recursion.drift)
+        drift = np.einsum("s,dsmrc->dmrc", state_weights, recursion.drift)
         drift = np.where(paths.bounds, drift, np.nan)
-        return best_trust(paths, extra, drift, beta0.max(-1), recursion.start @ view)
+        return best_trust(paths, extra, drift, beta0.max(-1), recursion.start @ state_weights)
 
     # Otherwise, one search for each cell.
     drift = recursion.drift.reshape(*recursion.start.shape, -1)
@@ -59,10 +60,10 @@ def _largest(paths: AdmissiblePaths, recursion: Recursion, view: np.ndarray) -> 
     no_cost = np.zeros(paths.bounds.size)
     for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
         graph = paths.to((row, col), extra).graph
-        weights = weights_of(TERMINAL, recursion, view, graph.longest)
+        weights = weights_of(TERMINAL, recursion, state_weights, graph.longest)
         values[:, row, col], _ = best_sums(graph, drift, weights, no_cost)
 
-    values[:, *paths.start] = recursion.start @ view
+    values[:, *paths.start] = recursion.start @ state_weights
     return values
 
 
