@@ -15,7 +15,7 @@ from trustbo.inference.draws import (
     is_of_people,
     joined_draws,
     missions_of,
-    sites_of,
+    parameters_of,
     theta_of,
 )
 from trustbo.inference.score import last_posterior, predictions, score
@@ -169,7 +169,7 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     where = list(zip(places["bound_row"].values, places["bound_col"].values, strict=True))
     of_cells = joined_draws(places["place"])[:, [cells.index(cell) for cell in where]]
     total = joined_draws(places["place_bound"]) + of_cells
-    inverse_gain = theta_of(posterior, sites_of(posterior))["inverse_gain"]
+    inverse_gain = theta_of(posterior, parameters_of(posterior))["inverse_gain"]
     draws = total / inverse_gain.reshape(len(total), -1).mean(
         1, keepdims=True
     )  # of stationary trust

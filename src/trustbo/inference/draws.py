@@ -58,7 +58,7 @@ def require_posterior(who: str, value: object) -> xr.DataTree:
     return value
 
 
-def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
+def parameters_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     """Return the parameter draws of a posterior by name, with chains joined in an axis (draw,).
 
     Variables that the model does not have, such as a user's own, are left out.
@@ -71,7 +71,7 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
     axes = model.dims | model.effect_dims
     draws = posterior["posterior"].to_dataset()
 
-    sites = {}
+    parameters = {}
     for name in map(str, draws):
         if name not in axes:
             continue
@@ -83,16 +83,16 @@ def sites_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
                 f"{name!r} of the posterior must have the dims {dims}; got {array.dims}. Give a "
                 "posterior from trustbo.fit with all its dims."
             )
-        sites[name] = joined_draws(array, axes[name])
+        parameters[name] = joined_draws(array, axes[name])
 
-    for name, values in sites.items():
+    for name, values in parameters.items():
         bad = np.isnan(values.reshape(len(values), -1)).any(1).sum()
         if bad:
             raise TrustboError(
                 f"{bad} of {len(values)} draws of {name!r} are NaN; drop these "
                 "draws with posterior.isel(draw=...) instead of masking them."
             )
-    return sites
+    return parameters
 
 
 def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
@@ -153,12 +153,12 @@ def _read_params(
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         posterior = in_order_of(posterior, workspace.team.names, workspace.features)
 
-    sites = sites_of(posterior)
-    needed = ("B0", "B") if "B0" in sites else ("beta0", "beta", "b", "delta_w", "delta_v")
-    missing = [name for name in needed if name not in sites]
+    parameters = parameters_of(posterior)
+    needed = ("B0", "B") if "B0" in parameters else ("beta0", "beta", "b", "delta_w", "delta_v")
+    missing = [name for name in needed if name not in parameters]
     if missing:
         raise TrustboError(
-            f"the posterior has no variable {missing[0]!r}, only {', '.join(sites)}. Give a "
+            f"the posterior has no variable {missing[0]!r}, only {', '.join(parameters)}. Give a "
             "posterior from trustbo.fit with unchanged names."
         )
 
@@ -166,25 +166,25 @@ def _read_params(
     memory = posterior.attrs.get("memory", "level")
     maps = {}
     if "places" in posterior.children:
-        maps = place_maps_of(posterior["places"].to_dataset(), sites)
+        maps = place_maps_of(posterior["places"].to_dataset(), parameters)
 
     found = []
     for is_drawn in next_mission:
-        ahead = sites | _robot_effects_ahead(posterior, sites, is_drawn)
+        ahead = parameters | _robot_effects_ahead(posterior, parameters, is_drawn)
         params = assemble_params(ahead, x0, memory)
         found.append(params._replace(**maps))  # pyright: ignore
     return found
 
 
 def _robot_effects_ahead(
-    posterior: xr.DataTree, sites: Mapping[str, np.ndarray], next_mission: bool
+    posterior: xr.DataTree, parameters: Mapping[str, np.ndarray], next_mission: bool
 ) -> dict[str, np.ndarray]:
     """Return the parameters (draw, robot, ...) that robot effects change in the next mission."""
     effects = [e for e in effects_of(posterior) if not isinstance(e, PlaceEffect)]
     if not effects:
         return {}
 
-    theta = theta_of(posterior, sites)
+    theta = theta_of(posterior, parameters)
     rng = np.random.default_rng(_NEXT_MISSION_SEED) if next_mission else None
     n_draws = len(theta["inverse_gain"])
     n_robots = posterior.attrs["n_robots"]
@@ -203,13 +203,13 @@ def _robot_effects_ahead(
         weights[:, :, sight] = slope[..., None] / len(sight)
         slope = np.zeros((n_draws, n_robots))
 
-    b = sites["b"].reshape(n_draws, -1) + slope
-    if "B0" in sites:
-        B = sites["B"].copy()
+    b = parameters["b"].reshape(n_draws, -1) + slope
+    if "B0" in parameters:
+        B = parameters["B"].copy()
         robot = np.arange(n_robots)
         B[:, :, robot, robot] += np.swapaxes(weights, 1, 2)
         return {"b": b, "B": B}
-    beta = sites["beta"] if sites["beta"].ndim == 3 else sites["beta"][:, None]
+    beta = parameters["beta"] if parameters["beta"].ndim == 3 else parameters["beta"][:, None]
     return {"b": b, "beta": beta + weights}
 
 
@@ -274,9 +274,9 @@ def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
     return {name: joined_draws(group[name], of_name) for name, of_name in axes.items()}
 
 
-def theta_of(posterior: xr.DataTree, sites: Mapping[str, np.ndarray]) -> Theta:
+def theta_of(posterior: xr.DataTree, parameters: Mapping[str, np.ndarray]) -> Theta:
     """Return the hyperparameters of draws by name, including `inverse_gain`; see `Theta`."""
-    return with_default_priors(json.loads(posterior.attrs["model_record"])).derived(sites)
+    return with_default_priors(json.loads(posterior.attrs["model_record"])).derived(parameters)
 
 
 def read_posterior(
@@ -307,7 +307,7 @@ def read_posterior(
     model = model.for_features(features)
 
     fitted = Density(model, model.observations(missions))
-    groups = {"posterior": sites_of(posterior)}
+    groups = {"posterior": parameters_of(posterior)}
     groups |= {effect.group: values_of(posterior, effect) for effect in model.effects}
     return fitted, draws_of(fitted, groups)
 
@@ -337,9 +337,9 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
     """Compute the prior mean of the parameters without effects; see `sample_prior`."""
     prior = _prior(model, n_features, n_robots)
     rng = np.random.default_rng(0)
-    sites = prior_parameters(prior, _N_MEAN, rng, even=True)
-    sites = {name: values.mean(0, keepdims=True) for name, values in sites.items()}
-    return assemble_params(sites, model.x0, model.memory)
+    parameters = prior_parameters(prior, _N_MEAN, rng, even=True)
+    parameters = {name: values.mean(0, keepdims=True) for name, values in parameters.items()}
+    return assemble_params(parameters, model.x0, model.memory)
 
 
 def _prior(model: TrustModel, n_features: int, n_robots: int) -> Density:

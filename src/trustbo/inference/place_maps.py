@@ -60,12 +60,12 @@ def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> 
     return xr.Dataset(variables, coords, {"shape": list(places.shape), "seed": seed})
 
 
-def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Draw the effects of all cells and bounds, given the effects at visited places.
 
     Args:
         group: Posterior group `places`.
-        sites: Hyperparameters (draw,) by name, with chains joined.
+        parameters: Hyperparameters (draw,) by name, with chains joined.
 
     Returns:
         Arrays place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The
@@ -76,12 +76,12 @@ def place_maps_of(group: xr.Dataset, sites: Mapping[str, np.ndarray]) -> dict[st
 
     s = _by_draw(group, "place", "cell")
     cells = np.column_stack([group[f"cell_{name}"].values for name in _CELL])
-    place = _cells(s, cells, (rows, cols), sites, [seed, 0])
+    place = _cells(s, cells, (rows, cols), parameters, [seed, 0])
 
     # Effects of bounds are independent, so only those of visited bounds are replaced.
     rng = np.random.default_rng([seed, 1])
     place_bound = rng.standard_normal((len(place), len(MOVE_NAMES), rows, cols))
-    place_bound *= sites["tau_e"][:, None, None, None]
+    place_bound *= parameters["tau_e"][:, None, None, None]
     _centre(place_bound)
     visited = tuple(group[f"bound_{name}"].values for name in _BOUND)
     place_bound[:, *visited] = _by_draw(group, "place_bound", "bound")
@@ -98,16 +98,16 @@ def _cells(
     s: np.ndarray,
     cells: np.ndarray,
     shape: tuple[int, int],
-    sites: Mapping[str, np.ndarray],
+    parameters: Mapping[str, np.ndarray],
     seed: list[int],
 ) -> np.ndarray:
     """Draw the effect (draw, row, col) over the grid, given the effect s at visited cells."""
     flat = cells[:, 0] * shape[1] + cells[:, 1]
     mean = np.zeros((len(s), shape[0] * shape[1]))
     off = np.empty(mean.shape)
-    for step, is_step, scale, weights in _kriging(sites["length_scale"], cells, shape):
+    for step, is_step, scale, weights in _kriging(parameters["length_scale"], cells, shape):
         rng = np.random.default_rng([*seed, step + _FIRST_SEED])
-        free = _prior(shape, scale, int(is_step.sum()), rng) * sites["tau_s"][is_step, None]
+        free = _prior(shape, scale, int(is_step.sum()), rng) * parameters["tau_s"][is_step, None]
 
         # Matheron's rule: s and a free draw are both kriged from the visited cells.
         mean[is_step] = s[is_step] @ weights

@@ -12,9 +12,9 @@ from trustbo.inference.density import Density, Draws
 from trustbo.inference.draws import (
     effects_of,
     missions_of,
+    parameters_of,
     read_posterior,
     require_posterior,
-    sites_of,
 )
 from trustbo.inference.latent import latent_of, replicate
 from trustbo.inference.variables import draw_prior
@@ -38,7 +38,7 @@ _KEPT = ("posterior", "sample_stats", "prior", "hazard")
 def to_datatree(
     groups: dict[str, dict[str, Any]],
     missions: Sequence[Mission],
-    site_dims: dict[str, tuple[str, ...]],
+    parameter_dims: dict[str, tuple[str, ...]],
     effects: Sequence[Effect] = (),
 ) -> xr.DataTree:
     """Build a DataTree with named axes, without padding, and with NaN after a mission's end.
@@ -46,7 +46,7 @@ def to_datatree(
     Args:
         groups: Arrays by group and name, with leading axes (chain, draw) except for moments.
         missions: Missions of the posterior.
-        site_dims: Axes of the model's parameters by name, without (chain, draw).
+        parameter_dims: Axes of the model's parameters by name, without (chain, draw).
         effects: Effects of the model; the groups may include variables of these effects.
     """
     observed = Observations.from_missions(missions)
@@ -61,7 +61,7 @@ def to_datatree(
         "robot_": list(missions[0].robots),
         "feature": list(missions[0].features),
     }
-    dims_of = _DIMS | site_dims
+    dims_of = _DIMS | parameter_dims
     for effect in effects:
         dims_of |= effect.variables
         coords |= effect.coords
@@ -235,7 +235,7 @@ def with_latent(
         "prior_predictive": {"contact_rate": replicated[None]},
         "log_prior": {
             name: by_chain(values)
-            for name, values in log_prior(fitted, sites_of(posterior)).items()
+            for name, values in log_prior(fitted, parameters_of(posterior)).items()
         },
     }
 
@@ -246,7 +246,7 @@ def with_latent(
     return whole
 
 
-def log_prior(fitted: Density, sites: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def log_prior(fitted: Density, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Compute the log prior density (draw,) of each parameter with an independent prior.
 
     Deviations of robots from a common mean belong to the model and not to the prior, so only means
@@ -256,27 +256,27 @@ def log_prior(fitted: Density, sites: Mapping[str, np.ndarray]) -> dict[str, np.
 
     Args:
         fitted: Density of the model given missions.
-        sites: Draws (draw, ...) of the parameters by name.
+        parameters: Draws (draw, ...) of the parameters by name.
     """
     model = fitted.model
     priors = fitted.scores.priors
     resolution = fitted.observations.resolution
-    inverse_gain = model.derived(sites)["inverse_gain"]
+    inverse_gain = model.derived(parameters)["inverse_gain"]
 
-    parameters = dict(sites)
-    if "delta_v" in sites:
-        parameters["delta_v"] = model.noise_without(sites["delta_v"], resolution)
-    densities = {n: log_density(p, parameters[n]) for n, p in priors.items() if n in sites}
-    for name, (field, values) in model.prior_terms(sites).items():
+    with_prior = dict(parameters)
+    if "delta_v" in parameters:
+        with_prior["delta_v"] = model.noise_without(parameters["delta_v"], resolution)
+    densities = {n: log_density(p, with_prior[n]) for n, p in priors.items() if n in parameters}
+    for name, (field, values) in model.prior_terms(parameters).items():
         if field == "delta_v":
             values = model.noise_without(values, resolution)
         given = inverse_gain.reshape(*inverse_gain.shape, *(1,) * (values.ndim - inverse_gain.ndim))
         densities[name] = model.priors.log_density(field, values, given)
 
     for noise in ("Delta_w", "Delta_v"):
-        if noise in sites:
-            sd = np.sqrt(np.einsum("...ii->...i", sites[noise]))
-            correlation = sites[noise] / (sd[..., :, None] * sd[..., None, :])
+        if noise in parameters:
+            sd = np.sqrt(np.einsum("...ii->...i", parameters[noise]))
+            correlation = parameters[noise] / (sd[..., :, None] * sd[..., None, :])
             log_det = np.linalg.slogdet(correlation)[1]
             densities[f"correlation_{noise[-1]}"] = (model.priors.concentration - 1.0) * log_det
 

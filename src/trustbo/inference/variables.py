@@ -22,9 +22,11 @@ def to_variables(density: Density, draws: Draws) -> dict[str, dict[str, np.ndarr
 
 def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:
     """Make draws from variables by group and name, as returned by `to_variables`."""
-    sites = groups["posterior"]
+    parameters = groups["posterior"]
     model = density.model
-    theta = model.derived({n: sites[n] for n in model.dims | model.effect_dims if n in sites})
+    theta = model.derived(
+        {n: parameters[n] for n in model.dims | model.effect_dims if n in parameters}
+    )
     theta = {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
 
     c = [

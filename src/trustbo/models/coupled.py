@@ -94,18 +94,20 @@ class CoupledTrust(TrustModel):
             adds_noise=self.likelihood.adds_noise,
         )
 
-    def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
+    def prior_terms(
+        self, parameters: Mapping[str, np.ndarray]
+    ) -> dict[str, tuple[str, np.ndarray]]:
         """See `TrustModel.prior_terms`; diagonal and off-diagonal entries are separate terms."""
-        off = ~np.eye(sites["b"].shape[-1], dtype=bool)
+        off = ~np.eye(parameters["b"].shape[-1], dtype=bool)
         diagonal = {
-            name: np.einsum("...ii->...i", sites[name]) for name in self.dims if name != "b"
+            name: np.einsum("...ii->...i", parameters[name]) for name in self.dims if name != "b"
         }
         return {
             "B0": ("beta0", diagonal["B0"]),
-            "B0_coupling": ("coupling", sites["B0"][..., off]),
+            "B0_coupling": ("coupling", parameters["B0"][..., off]),
             "B": ("beta", np.swapaxes(diagonal["B"], -1, -2)),
-            "B_coupling": ("coupling", sites["B"][..., off]),
-            "b": ("b", sites["b"]),
+            "B_coupling": ("coupling", parameters["B"][..., off]),
+            "b": ("b", parameters["b"]),
             "delta_w": ("delta_w", np.sqrt(diagonal["Delta_w"])),
             "delta_v": ("delta_v", np.sqrt(diagonal["Delta_v"])),
         }

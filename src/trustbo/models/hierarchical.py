@@ -33,9 +33,14 @@ class HierarchicalTrust(PooledTrust):
         spreads = {"tau_beta": tau.expand((n_features,)), "tau_b": tau}
         return super().hyperpriors(n_robots, n_features) | spreads
 
-    def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
+    def prior_terms(
+        self, parameters: Mapping[str, np.ndarray]
+    ) -> dict[str, tuple[str, np.ndarray]]:
         """See `TrustModel.prior_terms`; includes only the means of the robots' coefficients."""
-        return {"mean_beta": ("beta", sites["mean_beta"]), "mean_b": ("b", sites["mean_b"])}
+        return {
+            "mean_beta": ("beta", parameters["mean_beta"]),
+            "mean_b": ("b", parameters["mean_b"]),
+        }
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:

@@ -202,9 +202,11 @@ class TrustModel(Summary, ABC):
         # Rounding can make the difference of the squares slightly negative.
         return np.sqrt(np.maximum((delta_v - resolution) * (delta_v + resolution), 0.0))
 
-    def prior_terms(self, sites: Mapping[str, np.ndarray]) -> dict[str, tuple[str, np.ndarray]]:
+    def prior_terms(
+        self, parameters: Mapping[str, np.ndarray]
+    ) -> dict[str, tuple[str, np.ndarray]]:
         """Return further terms of the log prior by label, each as (field of `Priors`, values)."""
-        return {name: (name, sites[name]) for name in ("beta", "b")}
+        return {name: (name, parameters[name]) for name in ("beta", "b")}
 
     def observations(
         self, missions: Sequence[Mission], workspace: Workspace | None = None

@@ -296,22 +296,22 @@ _MOST_SHOWN = 6  # numbers of a field that a summary shows; of longer fields, it
 
 
 def assemble_params(
-    sites: Mapping[str, np.ndarray], x0: Mapping[str, float], memory: str = "level"
+    parameters: Mapping[str, np.ndarray], x0: Mapping[str, float], memory: str = "level"
 ) -> Params:
     """Build parameters from variables (draw, ...) by name, and from x0_mean and x0_sd.
 
     `memory` is the quantity carried over between bounds; see `PooledTrust`.
     """
-    if "B0" in sites:
-        return CoupledParams(**{name: sites[name] for name in COUPLED_NAMES}, **x0)
+    if "B0" in parameters:
+        return CoupledParams(**{name: parameters[name] for name in COUPLED_NAMES}, **x0)
 
-    values: dict[str, Any] = {name: sites[name] for name in _POOLED_NAMES}
-    values["delta_s"] = sites.get("delta_s")
-    if sites["b"].ndim == 1:
+    values: dict[str, Any] = {name: parameters[name] for name in _POOLED_NAMES}
+    values["delta_s"] = parameters.get("delta_s")
+    if parameters["b"].ndim == 1:
         return TrustParams(**values, **x0, memory=memory)
 
     for name in ("beta0", "delta_w", "delta_v"):  # robots share these in the hierarchical model
-        values[name] = np.broadcast_to(values[name][:, None], sites["b"].shape)
+        values[name] = np.broadcast_to(values[name][:, None], parameters["b"].shape)
     return RobotParams(**values, **x0, memory=memory)
 
 
