@@ -45,7 +45,7 @@ def test_match_has_the_moments_of_quadrature(name, y, m, v, sd):
         sum(quad(lambda f, k=k: f**k * of(f), a, b)[0] for a, b in ends) for k in range(3)
     )
     one = (np.array([x]) for x in (y, N, m, v, sd))
-    log_mass, mean, var = (float(x[0]) for x in family.match(*one))
+    log_mass, mean, var = (float(x[0]) for x in family.moment_match(*one))
     rtol = 2e-2 if name == "beta_binomial" else 1e-5
     np.testing.assert_allclose(np.exp(log_mass), mass, rtol=rtol)
     np.testing.assert_allclose(mean, first / mass, atol=rtol * np.sqrt(v))
@@ -58,7 +58,7 @@ def test_weighted_draws_have_the_matched_moments(name, y, m, v, sd):
     args = [np.full(n, x) for x in (y, N, m, v, sd)]
     f, log_weight = family.draw(*args, np.random.default_rng(0))
     weight = np.exp(log_weight)
-    log_mass, mean, var = (x[0] for x in family.match(*args))
+    log_mass, mean, var = (x[0] for x in family.moment_match(*args))
     rtol = 0.03 if name == "beta_binomial" else 1e-6
     np.testing.assert_allclose(np.log(weight.mean()), log_mass, atol=rtol)
     found = weight @ f / weight.sum()
@@ -68,7 +68,7 @@ def test_weighted_draws_have_the_matched_moments(name, y, m, v, sd):
 @pytest.mark.parametrize("name", ALL)
 def test_a_rate_that_was_not_measured_teaches_nothing(name):
     none = (np.array([x]) for x in (np.nan, N, 0.3, 0.2, 0.1))
-    np.testing.assert_allclose(np.ravel(ALL[name].match(*none)), [0.0, 0.3, 0.2])
+    np.testing.assert_allclose(np.ravel(ALL[name].moment_match(*none)), [0.0, 0.3, 0.2])
 
 
 @pytest.mark.parametrize("name", FAMILIES)

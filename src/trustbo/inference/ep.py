@@ -84,7 +84,7 @@ def first_sites(rates: Rates) -> Sites:
     v = np.full(y.shape, (_VAGUE_SD * unit) ** 2)
     noise = np.full(y.shape, _USUAL_NOISE)
 
-    _, mean, var = rates.likelihood.match(y, rates.n_ticks, m, v, noise)
+    _, mean, var = rates.likelihood.moment_match(y, rates.n_ticks, m, v, noise)
     return _matched(rates, 1.0 / v[None], m / v, mean, var)
 
 
@@ -124,7 +124,7 @@ def log_evidence(
         v = 1.0 / rest
 
         # Moments of the cavity times the likelihood term, and the log evidence (3.57 and 3.65).
-        log_mass, mean, var = rates.likelihood.match(rates.y, rates.n_ticks, m, v, sd)
+        log_mass, mean, var = rates.likelihood.moment_match(rates.y, rates.n_ticks, m, v, sd)
         log_p = fit.log_p + np.where(seen, log_mass - _overlap(y, lam, m, v), 0.0).sum((1, 2))
 
         # The site that gives these moments (3.59), damped.

@@ -178,12 +178,14 @@ def _prediction(
 
     found: dict[str, Any] = {}
     if not np.isnan(y):
-        log_mass, _, _ = likelihood.match(y, ticks, center, var, sd)
+        log_mass, _, _ = likelihood.moment_match(y, ticks, center, var, sd)
         found["log_score"] = np.log(max(weight @ np.exp(log_mass), _LEAST_MASS))
 
     if levels:  # the probability of each answer is known
         answers = np.arange(levels) / (levels - 1.0)
-        log_masses = [likelihood.match(answer, ticks, center, var, sd)[0] for answer in answers]
+        log_masses = [
+            likelihood.moment_match(answer, ticks, center, var, sd)[0] for answer in answers
+        ]
         mass = weight @ np.exp(np.stack(log_masses, axis=1))
         mass = np.maximum(mass, _LEAST_MASS) / mass.sum()
         which = np.searchsorted(np.cumsum(mass) - _CLOSE, QUANTILES)

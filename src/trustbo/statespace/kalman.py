@@ -18,7 +18,7 @@ _JITTER = 1e-12  # added to covariances, which may be singular, before drawing
 class MomentMatching(Protocol):
     """The part of a likelihood that `update` needs."""
 
-    def match(self, y: Any, n_ticks: Any, mean: Any, var: Any, sd: Any, /) -> Any:
+    def moment_match(self, y: Any, n_ticks: Any, mean: Any, var: Any, sd: Any, /) -> Any:
         """Match the moments of N(f; mean, var) times the likelihood of the rate y.
 
         Returns the log mass, mean and variance of the product; 0, mean and var where y is NaN.
@@ -109,7 +109,7 @@ def update(
         k = first + i
         m = mean[..., k]
         v = cov[..., k, k]
-        log_mass, m_after, v_after = likelihood.match(
+        log_mass, m_after, v_after = likelihood.moment_match(
             rate, n_ticks[..., i], m, v, space.noise_sd[..., i]
         )
         gain = cov[..., k] / v[..., None]
@@ -129,7 +129,7 @@ def marginal_log_densities(
         cov = cov + space.shared_cov
 
     var = np.diagonal(cov, axis1=-2, axis2=-1)
-    log_mass = likelihood.match(y, n_ticks, predicted.mean, var, space.noise_sd)[0]
+    log_mass = likelihood.moment_match(y, n_ticks, predicted.mean, var, space.noise_sd)[0]
     return np.where(np.isnan(y), 0.0, log_mass).reshape(len(var), -1)
 
 
@@ -185,8 +185,10 @@ def gaussian_match(y: Any, mean: Any, var: Any, sd: Any) -> tuple[Any, Any, Any]
 class GaussianRates:
     """Likelihood of Gaussian rates in JAX; NaN marks rates that were not measured."""
 
-    def match(self, y: Any, n_ticks: Any, mean: Any, var: Any, sd: Any, /) -> tuple[Any, Any, Any]:
-        """See `MomentMatching.match`."""
+    def moment_match(
+        self, y: Any, n_ticks: Any, mean: Any, var: Any, sd: Any, /
+    ) -> tuple[Any, Any, Any]:
+        """See `MomentMatching.moment_match`."""
         xp = namespace(mean)
         seen = ~xp.isnan(y)
         log_mass, after, left = gaussian_match(xp.where(seen, y, 0.0), mean, var, sd)

@@ -74,7 +74,7 @@ class Family(ABC):
         """Return the default priors that differ from those of `Priors()`, by name."""
         return {}
 
-    def match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
+    def moment_match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
         """Compute the moments of `_match`; where y is NaN, they are 0, m and v."""
         seen, arrays = _measured(y, N, m, v, sd)
         one, mean, var = self._match(*arrays)
