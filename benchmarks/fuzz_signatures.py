@@ -217,7 +217,7 @@ def kinematic() -> tb.simulation.KinematicSimulator:
 
 @cache
 def truth() -> tb.simulation.Truth:
-    return tb.simulation.Truth.of(kinematic(), n_replicates=1)
+    return tb.simulation.Truth.from_simulator(kinematic(), n_replicates=1)
 
 
 def small_case() -> dict[str, dict[str, Any]]:
@@ -341,7 +341,7 @@ def of_models() -> list[Call]:
         Call("models.PlaceEffect", tb.models.PlaceEffect, place),
         Call("models.RobotEffect", tb.models.RobotEffect, robot),
         Call("models.Priors", tb.models.Priors, numbers),
-        Call("models.Priors.of", tb.models.Priors.of, of_names),
+        Call("models.Priors.from_features", tb.models.Priors.from_features, of_names),
         Call("models.default_model", tb.models.default_model, {"places": True}),
         Call("hazard.Hazard", tb.hazard.Hazard, hazard),
     ]
@@ -505,7 +505,7 @@ def of_simulation() -> list[Call]:
         Call("simulation.RadioSimulator", s.RadioSimulator, {"workspace": hills(), "seed": 0}),
         Call("simulation.ReplaySimulator", s.ReplaySimulator, {"missions": [mission()]}),
         Call("simulation.ReplaySimulator.run", replay.run, run),
-        Call("simulation.Truth.of", s.Truth.of, of_truth),
+        Call("simulation.Truth.from_simulator", s.Truth.from_simulator, of_truth),
         Call("simulation.Truth.at", t.at, {"mission": 0}),
         Call("simulation.Truth.lost", t.lost, {"path": SHORT}),
         Call("simulation.Truth.best", t.best, best),

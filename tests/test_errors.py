@@ -77,7 +77,7 @@ MISTAKES = {
     "extinction below 0": (lambda w: tb.workspace.Sight(extinction=-0.1), "extinction"),
     "one number for a mean and an sd": (lambda w: tb.hazard.Hazard(margin=0.5), "margin"),
     "no effects": (lambda w: PooledTrust(effects=None), "effects"),
-    "an unknown family": (lambda w: Priors.of(("a",), family="x"), "family"),
+    "an unknown family": (lambda w: Priors.from_features(("a",), family="x"), "family"),
     "a model as text": (lambda w: tb.inference.sample_prior("x", 2, 5, 0), "model"),
     "a quantile as text": (
         lambda w: optimistic(RNG, PARAMS, Planner(w, *ENDS), quantile="9"),
@@ -108,6 +108,9 @@ RENAMED = {
     "tau_mission": (lambda w: tb.models.RobotEffect(tau_day=0.1), "tau_day"),
     "bound_cost": (lambda w: Planner(w, *ENDS, toll=0.1), "toll"),
     "family": (lambda w: PooledTrust(observation="censored"), "observation"),
+    "from_features": (lambda w: Priors.of(("a",)), "Priors.of"),
+    "from_simulator": (lambda w: Truth.of(None), "Truth.of"),
+    "from_space": (lambda w: tb.models.ContactRate.of(None, None), "ContactRate.of"),
 }
 """Calls with an old name, by the new name, with the old name."""
 HUGE = {
@@ -117,7 +120,7 @@ HUGE = {
     "n_iterations": lambda w, n: list(tb.Campaign(w, *ENDS).run(ModelSimulator(w, PARAMS), n)),
     "max_bounds": lambda w, n: Planner(w, *ENDS, max_bounds=n),
     "max_bounds of the fewest and more": lambda w, n: Planner(w, *ENDS, max_bounds=f"shortest+{n}"),
-    "n_replicates": lambda w, n: Truth.of(KinematicSimulator(hills()), n_replicates=n),
+    "n_replicates": lambda w, n: Truth.from_simulator(KinematicSimulator(hills()), n_replicates=n),
     "n_missions": lambda w, n: tb.study.run_grid({}, {}, "study", n_missions=n),
     "seed": lambda w, n: Planner(w, *ENDS).plan_draws(PARAMS, seed=n),
 }

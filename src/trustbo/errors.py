@@ -198,7 +198,8 @@ class Renamed:
 
         owner: Any = decorated
         owner.__init__ = self._checked(owner.__init__)
-        owner.__getattr__ = self._refuse_attribute
+        for old, new in self._new_names.items():
+            setattr(owner, old, OldName(new, old))
         return owner
 
     def _checked(self, function: Any) -> Any:
@@ -213,18 +214,25 @@ class Renamed:
 
         return checked
 
-    @property
-    def _refuse_attribute(self) -> Callable[[Any, str], Any]:
-        """A method `__getattr__`, which Python calls for attributes that do not exist."""
-        new_names = self._new_names
 
-        def refuse(owner: Any, name: str) -> Any:
-            kind = type(owner).__name__
-            if name in new_names:
-                raise RenamedAttributeError(f"{kind}.{name} is now called {new_names[name]!r}.")
-            raise AttributeError(f"{kind!r} object has no attribute {name!r}", name=name, obj=owner)
+class OldName:
+    """Old name of an attribute or a constructor; a use raises an error that gives the new name.
 
-        return refuse
+    Example:
+        >>> class Priors:
+        >>>     of = OldName("from_features")
+    """
+
+    def __init__(self, new: str, old: str = "") -> None:
+        self._new = new
+        self._old = old
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._old = name
+
+    def __get__(self, instance: object, owner: type) -> Any:
+        """Raise RenamedAttributeError."""
+        raise RenamedAttributeError(f"{owner.__name__}.{self._old} is now called {self._new!r}.")
 
 
 class RenamedAttributeError(TrustboError, AttributeError):

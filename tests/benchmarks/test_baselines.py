@@ -174,7 +174,7 @@ def test_a_baseline_is_that_of_line_of_sight_at_first_and_leaves_a_path_that_is_
 def test_the_oracle_is_without_regret_in_the_world_of_each_mission(workspace, tmp_path):
     blind = [Degradation(robot, 0.0, first=1, last=1) for robot in ("r1", "r2")]
     simulator = KinematicSimulator(workspace, events=blind)
-    truth = Truth.of(simulator, n_replicates=1, folder=tmp_path)
+    truth = Truth.from_simulator(simulator, n_replicates=1, folder=tmp_path)
     policy = oracle.Oracle(truth)
     now = Planner(workspace, START, GOAL, "lost_contact", max_bounds="shortest+2")
     campaign = SimpleNamespace(planner=now)

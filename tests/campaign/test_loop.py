@@ -200,7 +200,7 @@ class Steady:
 
 
 def test_regret_against_the_truth_is_in_the_figure_of_the_history(workspace):
-    truth = tb.simulation.Truth.of(Steady(workspace))
+    truth = tb.simulation.Truth.from_simulator(Steady(workspace))
     result = run(workspace, n_iterations=2, simulator=Steady(workspace))
     with pytest.raises(tb.TrustboError, match="truth"):
         result.plot_history(Steady(workspace))

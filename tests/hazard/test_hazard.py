@@ -262,7 +262,7 @@ def test_the_hazard_is_calibrated():
 
 def test_missions_count_as_exposures_up_to_where_they_end():
     path = ((0, 0), (0, 1), (0, 2), (1, 2))
-    counted = Exposures.of(
+    counted = Exposures.from_missions(
         [mission(path), mission(path, "stuck", 2), mission(path, "aborted", 2)],
         [LostMission(path, (0, 1)), LostMission(path)],
     )

@@ -131,7 +131,7 @@ def test_few_points_give_a_proposal_near_the_one_before():
     near = importance.Student(np.zeros(2), np.array([[2.0, 0.0], [1.0, 1.0]]))
     z = 1e-3 * np.random.default_rng(10).standard_normal((3, 2))
 
-    fitted = importance.Student.of(z, np.full(3, 1.0 / 3.0), near)
+    fitted = importance.Student.from_points(z, np.full(3, 1.0 / 3.0), near)
 
     covariance = fitted.scale @ fitted.scale.T
     assert (np.diag(covariance) > 0.5 * np.diag(near.scale @ near.scale.T)).all()

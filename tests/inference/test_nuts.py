@@ -17,7 +17,7 @@ def scores():
 
 @pytest.fixture(scope="module")
 def coordinates(scores):
-    return Whitened.of(scores)
+    return Whitened.from_scores(scores)
 
 
 def test_scores_invert_whiten(scores, coordinates):

@@ -68,7 +68,7 @@ def test_the_truth_of_a_mission_with_an_event_is_the_mean_of_many(wooded, name):
     thin = Sight(extinction=0.03, crown_base=0.3)
     event = EVENTS[name](wooded.grid.center((0, 1)))
     simulator = KinematicSimulator(wooded, terrain=scrub, sight=thin, events=[event])
-    known, n = Truth.of(simulator), 120
+    known, n = Truth.from_simulator(simulator), 120
     # The runs of a mission share the factors of fouling.
     numbers = range(1, n + 1) if name == "fouling" else [1] * n
     drawn = [simulator.run(PATH, seed=j, mission=m) for j, m in enumerate(numbers)]
@@ -83,12 +83,14 @@ def test_the_truth_of_a_mission_with_an_event_is_the_mean_of_many(wooded, name):
 
 def test_days_with_the_same_weather_have_one_truth(wooded, tmp_path):
     rain = [Degradation("r2", 0.2, first=day, last=day) for day in (1, 3)]
-    known = Truth.of(KinematicSimulator(wooded, events=rain), n_replicates=1, folder=tmp_path)
+    known = Truth.from_simulator(
+        KinematicSimulator(wooded, events=rain), n_replicates=1, folder=tmp_path
+    )
     assert known.at(1) is known.at(3)
     assert known.at(0) is known.at(2) is known.at(4)
     assert len(list(tmp_path.iterdir())) == 2
     other = KinematicSimulator(wooded, events=[Degradation("r2", 0.2)])
-    Truth.of(other, n_replicates=1, folder=tmp_path)  # the world of rain
+    Truth.from_simulator(other, n_replicates=1, folder=tmp_path)  # the world of rain
     assert len(list(tmp_path.iterdir())) == 2
 
 

@@ -72,7 +72,7 @@ def test_impossible_settings_are_refused(workspace, options):
 
 def test_a_model_has_no_table_of_bounds(workspace):
     with pytest.raises(TrustboError):
-        Truth.of(ModelSimulator(workspace, PARAMS))
+        Truth.from_simulator(ModelSimulator(workspace, PARAMS))
 
 
 def test_true_awareness_and_probabilities_are_read_by_name(workspace):

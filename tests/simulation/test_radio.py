@@ -29,7 +29,7 @@ def test_the_expected_rate_is_that_of_quadrature(mean):
 
 
 def test_its_truth_is_the_mean_of_its_missions(radio):
-    known, n = Truth.of(radio), 1500
+    known, n = Truth.from_simulator(radio), 1500
     rates = np.stack([radio.run(PATH, seed=seed).contact_rate.mean(1) for seed in range(n)])
     error = rates.std(0) / n**0.5
     np.testing.assert_array_less(np.abs(known._along(PATH)[0] - rates.mean(0)), 4.5 * error)

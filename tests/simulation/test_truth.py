@@ -26,7 +26,7 @@ def wooded():
 
 @pytest.fixture(scope="module")
 def of_wooded(wooded):
-    return Truth.of(wooded, n_replicates=6)
+    return Truth.from_simulator(wooded, n_replicates=6)
 
 
 def grid(shape=(3, 4), walls=()):
@@ -77,7 +77,7 @@ def test_the_table_is_the_mean_of_many_missions(wooded, of_wooded):
 
 
 def test_replicates_of_another_seed_agree(wooded, of_wooded):
-    other = Truth.of(wooded, n_replicates=3, seed=1).bounds
+    other = Truth.from_simulator(wooded, n_replicates=3, seed=1).bounds
     gap = (of_wooded.bounds["contact"] - other["contact"]).values
     assert np.sqrt(np.nanmean(gap**2)) < 0.015
 
@@ -88,7 +88,7 @@ def test_tracks_that_outlast_misses_are_simulated():
         hillside(60.0, 60.0), (2, 2), Team(robots=(robot,), lead=robot)
     )
     simulator = KinematicSimulator(workspace)
-    found, path = Truth.of(simulator, n_replicates=20), ((1, 0), (0, 0), (0, 1))
+    found, path = Truth.from_simulator(simulator, n_replicates=20), ((1, 0), (0, 0), (0, 1))
     rates = np.mean([simulator.run(path, seed=s).contact_rate for s in range(150)], axis=(0, 2))
     np.testing.assert_allclose(found._along(path)[0], rates, atol=0.05)
 
@@ -102,14 +102,16 @@ def test_cached_truths_of_two_terrains_are_two(wooded, tmp_path):
             terrain, (3, 3), Team(1), features=features, bounds=False
         )
         simulator = KinematicSimulator(workspace)
-        cached = Truth.of(simulator, n_replicates=1, folder=tmp_path)
-        xr.testing.assert_identical(cached.bounds, Truth.of(simulator, n_replicates=1).bounds)
+        cached = Truth.from_simulator(simulator, n_replicates=1, folder=tmp_path)
+        xr.testing.assert_identical(
+            cached.bounds, Truth.from_simulator(simulator, n_replicates=1).bounds
+        )
     assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_bounds_that_fail_say_so_and_keep_no_contact(wooded):
     simulator = KinematicSimulator(wooded.workspace, bound_timeout=5.0)  # nobody arrives in 5 s
-    found = Truth.of(simulator, n_replicates=1)
+    found = Truth.from_simulator(simulator, n_replicates=1)
     exists = existing_bounds(simulator.workspace.passable.values)
     assert (found.bounds["passed"].values[exists, 8] == 0.0).all()
     assert found.lost(PATH) == found.lost_or_failed(PATH) == 3.0
@@ -130,24 +132,26 @@ class Plain:
 
 
 def test_any_simulator_has_a_truth():
-    found = Truth.of(Plain(grid((2, 3))), n_replicates=30)
+    found = Truth.from_simulator(Plain(grid((2, 3))), n_replicates=30)
     rates = found._along([(0, 0), (1, 0), (1, 1), (1, 2), (0, 2)])[0]
     np.testing.assert_allclose(rates, [0.0, 0.0, 0.2, 0.8], atol=0.025)
 
 
 def test_a_truth_is_found_once_and_read_from_its_file_again(tmp_path, monkeypatch):
-    first = Truth.of(Plain(grid((2, 2))), n_replicates=2, folder=tmp_path)
+    first = Truth.from_simulator(Plain(grid((2, 2))), n_replicates=2, folder=tmp_path)
     monkeypatch.setattr(Plain, "run", None)  # would be an error
-    again = Truth.of(Plain(grid((2, 2))), n_replicates=2, folder=tmp_path)
+    again = Truth.from_simulator(Plain(grid((2, 2))), n_replicates=2, folder=tmp_path)
     xr.testing.assert_equal(again.bounds, first.bounds)
     for options in ({"n_replicates": 3}, {"n_replicates": 2, "seed": 1}):
         with pytest.raises(TypeError):
-            Truth.of(Plain(grid((2, 2))), folder=tmp_path, **options)
+            Truth.from_simulator(Plain(grid((2, 2))), folder=tmp_path, **options)
     with pytest.raises(TypeError):
-        Truth.of(Plain(grid((2, 3))), n_replicates=2, folder=tmp_path)
+        Truth.from_simulator(Plain(grid((2, 3))), n_replicates=2, folder=tmp_path)
     patient = Team(robots=(Robot(acquire=3),))
     with pytest.raises(TypeError):
-        Truth.of(Plain(replace(grid((2, 2)), team=patient)), n_replicates=2, folder=tmp_path)
+        Truth.from_simulator(
+            Plain(replace(grid((2, 2)), team=patient)), n_replicates=2, folder=tmp_path
+        )
 
 
 @pytest.mark.parametrize("failures", [False, True])
@@ -175,7 +179,7 @@ def test_the_best_path_is_that_of_enumeration(max_bounds, failures):
 
 def test_impossible_truths_are_refused():
     with pytest.raises(TrustboError):
-        Truth.of(object())
+        Truth.from_simulator(object())
     truth = made_up(random_cells(), np.random.default_rng(0))
     with pytest.raises(TrustboError):
         truth.lost([(2, 0), (0, 2)])

@@ -106,8 +106,8 @@ def test_the_filter_has_the_density_and_the_trust_of_the_joint_normal(name):
     y = rng.normal(size=(K, 1, 3))
     y[1, 0, 2] = np.nan
     y[3] = np.nan
-    layout = Layout.of(np.full((1, K, 3), np.nan), joint=True)
-    predictor = LinearPredictor.of(space, layout)
+    layout = Layout.from_rates(np.full((1, K, 3), np.nan), joint=True)
+    predictor = LinearPredictor.from_space(space, layout)
     belief = kalman.initial(space, 1)
     log_density = 0.0
     for k in range(K):
@@ -133,8 +133,8 @@ def test_the_filter_has_the_density_and_the_trust_of_the_joint_normal(name):
 def test_contrasts_of_exchangeable_robots_are_independent():
     space = SPACES["shared noise"]
     rotation = helmert(3, full=True)
-    joint = LinearPredictor.of(space, Layout((1, K, 3), joint=True))
-    apart = LinearPredictor.of(space, Layout((1, K, 3), rotation=rotation))
+    joint = LinearPredictor.from_space(space, Layout((1, K, 3), joint=True))
+    apart = LinearPredictor.from_space(space, Layout((1, K, 3), rotation=rotation))
     turn = np.kron(np.eye(K), rotation)
     for point in range(2):
         cov = turn @ joint.covariance[point, 0] @ turn.T

@@ -33,7 +33,7 @@ class Steady:
 def scene(seed, breaks=None):
     z = np.random.default_rng(seed).uniform(size=(2, 3, 3, 2))
     workspace = tb.Workspace.from_awareness(z)
-    truth = Truth.of(Steady(workspace), n_replicates=1)
+    truth = Truth.from_simulator(Steady(workspace), n_replicates=1)
     simulator, labels = Steady(workspace, breaks), {"ground": f"made {seed}"}
     return Scene(workspace, simulator, (2, 0), (0, 2), truth, labels=labels)
 

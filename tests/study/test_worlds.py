@@ -82,7 +82,9 @@ def test_under_the_true_limit_a_path_leads_to_the_goal_on_both_courses(world, re
     if not world.is_packaged:
         world = dataclasses.replace(world, data=str(request.getfixturevalue("real_data")))
     workspace = world.workspace()
-    passed = Truth.of(world.simulator(workspace), n_replicates=1).bounds["passed"].values
+    passed = (
+        Truth.from_simulator(world.simulator(workspace), n_replicates=1).bounds["passed"].values
+    )
     assert np.nanmin(passed) == 0.0
     # Where every bound that passes keeps all contact, a path that arrives loses none.
     truth = Truth(workspace, table_of(np.where(np.isfinite(passed), 1.0, np.nan), passed))

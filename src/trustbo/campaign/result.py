@@ -278,7 +278,7 @@ class Result(Summary):
 
         history = self.history
         if truth is not None:
-            require_kind("truth", truth, Truth, "give simulation.Truth.of(simulator)")
+            require_kind("truth", truth, Truth, "give simulation.Truth.from_simulator(simulator)")
 
             longest = self.planner.max_bounds
             paths = [entry.plan.path for entry in self.state.entries]

@@ -43,7 +43,7 @@ class Exposures(NamedTuple):
     lost: tuple[np.ndarray, ...]
 
     @classmethod
-    def of(cls, missions: Sequence[Mission], lost: Sequence[LostMission] = ()) -> Self:
+    def from_missions(cls, missions: Sequence[Mission], lost: Sequence[LostMission] = ()) -> Self:
         """Count the exposures in measured missions and in lost missions.
 
         The last bound of a failed mission counts as a failure. An aborted bound is not counted.

@@ -85,7 +85,7 @@ def fit_hazard(
     """
     started = time.perf_counter()
     hazard = hazard or Hazard()
-    exposures = Exposures.of(missions, lost)
+    exposures = Exposures.from_missions(missions, lost)
     difficulty = difficulty_of(workspace)
 
     shape = difficulty.shape[1:3]
@@ -162,7 +162,7 @@ def sample(
             # Sequential imputation (Kong, Liu and Wong 1994) corrects for dependent failures.
             places, log_fail = impute(alpha + failed, beta + n - failed, paths, rng)
             ratio = points.log_ratio + log_fail - log_any_fails(alpha, beta)
-            points = importance.Points.of(points.z, points.log_p, ratio, points.near)
+            points = importance.Points.from_log_weights(points.z, points.log_p, ratio, points.near)
 
         if points.k_hat <= importance.MAX_KHAT:
             break

@@ -107,7 +107,7 @@ class Density:
         self._chained = self.exact and observations.n_missions >= _CHAINED
 
         y = self.layout.rows(observations.contact_rate)
-        self.blocks = Blocks.of(
+        self.blocks = Blocks.from_rows(
             y, self._U, self.layout.label, apart=not self.exact, order=self._order()
         )
         if not self.exact:
@@ -134,7 +134,7 @@ class Density:
         met[entries.row * n_missions // n_rows, entries.col] = True
 
         n_chains = 0 if prior.chains is None else prior.chains.lasting.shape[1]
-        return Order.of(met, free, n_chains)
+        return Order.from_masks(met, free, n_chains)
 
     def without(self, mission: int) -> "Density":
         """Return the density without the data of one mission."""
@@ -301,7 +301,9 @@ class Density:
 
     def prior(self, theta: Theta) -> Prior:
         """Return the prior on all coefficients at each theta."""
-        return Prior.of([effect.prior(theta, self.observations) for effect in self.model.terms])
+        return Prior.from_groups(
+            [effect.prior(theta, self.observations) for effect in self.model.terms]
+        )
 
     def _prior_of_fit(self, theta: Theta) -> Prior:
         """Return the prior in the form that is fastest for computing the evidence."""
@@ -323,7 +325,7 @@ class Density:
             of_columns = xp.repeat(chains.independent, n_missions, axis=1)
             groups.append((None, [of_columns]))
 
-        prior = Prior.of(groups)
+        prior = Prior.from_groups(groups)
         if chains is None:
             return prior
         return prior.with_chains(chains, first, n_missions)

@@ -48,7 +48,7 @@ class Blocks(NamedTuple):
     order: Order
 
     @classmethod
-    def of(
+    def from_rows(
         cls, y: np.ndarray, U: Any, label: np.ndarray, *, order: Order, apart: bool = False
     ) -> Self:
         """Group blocks into kinds; a kind has blocks with equal labels and equal missing rows.
@@ -119,7 +119,7 @@ class Prior(NamedTuple):
     first: int = 0  # first column with a lasting part
 
     @classmethod
-    def of(cls, groups: Sequence[tuple[Any, Sequence[Any]]]) -> Self:
+    def from_groups(cls, groups: Sequence[tuple[Any, Sequence[Any]]]) -> Self:
         """Combine groups of columns, each with a mean (point, k) or None and with precisions."""
         means = []
         parts = []
@@ -276,7 +276,7 @@ def evidence(
     log_p = log_sites @ n_of_kind + 0.5 * (prior.log_det - (w**2).sum((1, 2)))
 
     # With A = F F', integrating over c adds h' A^-1 h / 2 = |F^-1 h|^2 / 2 and -log |F|.
-    F = Factor.of(b.order, A)
+    F = Factor.from_precision(b.order, A)
     half = F.forward(h)
     return Fit(log_p + 0.5 * (half**2).sum(1) - F.log_det, F, half, W)
 
@@ -321,7 +321,7 @@ def marginals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the mean and variance (point, block, row) of every predictor given all sites.
 
-    Each block must be a separate kind (`apart` in `Blocks.of`), so that kind i is block i.
+    Each block must be a separate kind (`apart` in `Blocks.from_rows`), so that kind i is block i.
     """
     V = each(predictor.covariance, blocks.label)
     T = each(predictor.response, blocks.label)

@@ -49,7 +49,7 @@ class Order(NamedTuple):
     hidden: np.ndarray  # (mission, chain), hidden columns
 
     @classmethod
-    def of(cls, met: np.ndarray, free: np.ndarray, n_chains: int = 0) -> Self:
+    def from_masks(cls, met: np.ndarray, free: np.ndarray, n_chains: int = 0) -> Self:
         """Find the elimination order of the columns.
 
         Args:
@@ -156,7 +156,7 @@ class Factor(NamedTuple):
     H: Any  # (point, core, core), upper triangles; entries below are arbitrary
 
     @classmethod
-    def of(cls, order: Order, A: Any) -> Self:
+    def from_precision(cls, order: Order, A: Any) -> Self:
         """Factor precisions stored in vectors A (point, entry); in NumPy, A is overwritten."""
         xp = namespace(A)
         D, B, C = order.views(A)

@@ -93,7 +93,7 @@ def _of_data(blocks: Blocks) -> Callable[..., jax.Array]:
         h = jnp.concatenate([h, jnp.zeros((len(A), b.order.hidden.size))], axis=1)
 
         pairs = (T.mT @ PT)[:, :, *np.triu_indices(T.shape[3])]
-        F = Factor.of(b.order, add_products(A, b.at, b.sums, pairs.reshape(len(A), -1)))
+        F = Factor.from_precision(b.order, add_products(A, b.at, b.sums, pairs.reshape(len(A), -1)))
         half = F.forward(h)
 
         of_rates = log_det + np.log(2.0 * np.pi) * b.seen.sum(1)

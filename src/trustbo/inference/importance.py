@@ -107,7 +107,7 @@ class Student(NamedTuple):
     sides: np.ndarray = np.ones((2, 1))  # (2, score), factors of negative and positive elements
 
     @classmethod
-    def of(cls, z: np.ndarray, weight: np.ndarray, near: Self) -> Self:
+    def from_points(cls, z: np.ndarray, weight: np.ndarray, near: Self) -> Self:
         """Fit points z (point, score) with weights (point,) that sum to 1.
 
         A covariance has many elements, so it is averaged with the covariance of `near`, which
@@ -217,7 +217,9 @@ class Points(NamedTuple):
     near: Student
 
     @classmethod
-    def of(cls, z: np.ndarray, log_p: np.ndarray, log_ratio: np.ndarray, near: Student) -> Self:
+    def from_log_weights(
+        cls, z: np.ndarray, log_p: np.ndarray, log_ratio: np.ndarray, near: Student
+    ) -> Self:
         """Build weighted points by smoothing the importance weights."""
         return cls(z, log_p, log_ratio, *smoothed(log_ratio), near)
 
@@ -236,7 +238,7 @@ class Points(NamedTuple):
                 break
             weight = np.sqrt(weight) / np.sqrt(weight).sum()
 
-        return Student.of(self.z, weight, self.near)
+        return Student.from_points(self.z, weight, self.near)
 
     def resample(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw indices of `n` equally weighted points.
@@ -311,7 +313,7 @@ def sample(
         log_q = [density.log_density(z) + np.log(n) for density, n in mixture]
         log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
         log_ratio = np.where(np.isfinite(log_p), log_p, -np.inf) - log_q
-        points = Points.of(z, log_p, log_ratio, modes[0])
+        points = Points.from_log_weights(z, log_p, log_ratio, modes[0])
 
         good = points.k_hat < GOOD_KHAT
         if (good and points.kish > enough and n_rounds > 1) or n_rounds == most:

@@ -73,7 +73,7 @@ class Whitened(NamedTuple):
     root: np.ndarray  # (score, score), lower triangular
 
     @classmethod
-    def of(cls, z: np.ndarray) -> Self:
+    def from_scores(cls, z: np.ndarray) -> Self:
         """Fit the coordinates to scores z (point, score) by maximum likelihood."""
         shapes = [_marginal(one) for one in z.T]
         location, log_scale, skew, log_weight = np.transpose(shapes)
@@ -149,7 +149,7 @@ def sample_by_nuts(
         density.log_density, density.start()[None], rng, defensive=density.defensive
     )
     z = points.z[points.resample(_POINTS, rng)]
-    coordinates = Whitened.of(z)
+    coordinates = Whitened.from_scores(z)
 
     with own_settings():
         if density.exact:

@@ -54,7 +54,7 @@ def prior_parameters(
     observations = density.observations
     theta = model.theta(density.scores.draw(n, rng, even=even), observations.resolution)
 
-    weights = Prior.of([model.weights.prior(theta, observations)])
+    weights = Prior.from_groups([model.weights.prior(theta, observations)])
     c = weights.mean if even else weights.draw(rng)
     return {
         **_hyperparameters(density, theta),

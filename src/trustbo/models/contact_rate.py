@@ -9,7 +9,7 @@ from jax import Array, lax, random
 from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
-from trustbo.errors import TrustboError
+from trustbo.errors import OldName, TrustboError
 from trustbo.statespace import Inputs, StateSpace, kalman
 from trustbo.statespace.form import independent_robots
 from trustbo.statespace.matrices import apply, root
@@ -28,7 +28,7 @@ class ContactRate(dist.Distribution):
     ...     rates = ContactRate(drift, beta0, delta_w, delta_v)
     ...     numpyro.sample("contact_rate", rates, obs=contact_rate)
 
-    For robots that influence each other or share noise, see `ContactRate.of`.
+    For robots that influence each other or share noise, see `ContactRate.from_space`.
     """
 
     support = constraints.independent(constraints.real, 2)  # pyright: ignore
@@ -83,8 +83,10 @@ class ContactRate(dist.Distribution):
         )
         self._set(space, Inputs(drift))
 
+    of = OldName("from_space")
+
     @classmethod
-    def of(cls, space: StateSpace, inputs: Inputs) -> Self:
+    def from_space(cls, space: StateSpace, inputs: Inputs) -> Self:
         """Return the distribution for any state-space form.
 
         Args:

@@ -43,7 +43,7 @@ class TrustModel(Summary, ABC):
 
     Attributes:
         priors: Prior on each parameter. The default depends on the observation family and the
-            feature names; see `Priors.of`.
+            feature names; see `Priors.from_features`.
         family: Observation family: `"gaussian"` as in the paper, `"censored"` for rates that
             are censored at 0 and 1, or `"beta_binomial"` for the number of ticks in
             contact out of `Bound.n_ticks`, with trust on the logit scale.
@@ -137,7 +137,7 @@ class TrustModel(Summary, ABC):
 
     def layout(self, observations: Observations, *, contrasts: bool = True) -> Layout:
         """Arrange rates in blocks; unless `contrasts` is true, each row is one robot's rate."""
-        return Layout.of(
+        return Layout.from_rates(
             observations.contact_rate,
             joint=self.joint,
             exchangeable=self.exchangeable and contrasts and self.likelihood.gaussian,
@@ -150,7 +150,7 @@ class TrustModel(Summary, ABC):
     ) -> LinearPredictor:
         """Compute trust at all bounds from the state-space form, in NumPy or JAX."""
         space = self.state_space(theta, observations.n_robots)
-        return LinearPredictor.of(space, layout, self.random_effects(theta, observations))
+        return LinearPredictor.from_space(space, layout, self.random_effects(theta, observations))
 
     @property
     def terms(self) -> tuple[Effect, ...]:
@@ -227,11 +227,11 @@ class TrustModel(Summary, ABC):
     def for_features(self, features: Sequence[str]) -> Self:
         """Return the model with default priors for these features, or with its custom priors.
 
-        `fit` and campaigns call this method; see `Priors.of`.
+        `fit` and campaigns call this method; see `Priors.from_features`.
         """
         if self.priors is not Priors.default(self.family):
             return self
-        return replace(self, priors=Priors.of(tuple(features), self.family))
+        return replace(self, priors=Priors.from_features(tuple(features), self.family))
 
     def program(self, observations: Observations) -> None:
         """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.
@@ -257,7 +257,7 @@ class TrustModel(Summary, ABC):
                 drift=((dense * carried) @ c).reshape(observations.contact_rate.shape),
                 offset=((dense * ~carried) @ c).reshape(observations.contact_rate.shape),
             )
-            rates = ContactRate.of(self.state_space(theta, observations.n_robots), inputs)
+            rates = ContactRate.from_space(self.state_space(theta, observations.n_robots), inputs)
             with numpyro.plate("mission", observations.n_missions):
                 numpyro.sample("contact_rate", rates, obs=observations.contact_rate)
             return

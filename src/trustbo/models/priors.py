@@ -12,6 +12,7 @@ from numpyro.distributions import Distribution, constraints
 from trustbo.data import is_line_of_sight
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
+    OldName,
     TrustboError,
     require_choice,
     require_finite,
@@ -22,7 +23,8 @@ from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES
 from trustbo.models.scores import log_density
 
-# Prior sds of the coefficients of stationary trust, with line of sight (see `Priors.of`).
+# Prior sds of the coefficients of stationary trust, with line of sight (see
+# `Priors.from_features`).
 _SIGHT_SD = 0.3
 _FEATURE_SD = 0.25
 _INTERCEPT_SD = 0.15
@@ -104,8 +106,10 @@ class Priors(Summary):
         """
         return cls(**FAMILIES[family].priors())
 
+    of = OldName("from_features")
+
     @classmethod
-    def of(cls, features: Sequence[str], family: str = "gaussian") -> "Priors":
+    def from_features(cls, features: Sequence[str], family: str = "gaussian") -> "Priors":
         """Return the default priors for features with the given names.
 
         The feature `line_of_sight` predicts the contact rate. Stationary trust therefore has prior

@@ -43,9 +43,10 @@ def model_from_record(
         return given
 
     # The priors are default if one of these models has the record: `Priors.default` (the object
-    # itself, which stands for priors by feature), equal priors as another object, or `Priors.of`.
+    # itself, which stands for priors by feature), equal priors as another object, or
+    # `Priors.from_features`.
     default = with_default_priors(record)
-    of_features = Priors.of(features, record["family"])
+    of_features = Priors.from_features(features, record["family"])
     for priors in (default.priors, replace(default.priors), of_features):
         model = replace(default, priors=priors)
         if model_to_record(model) == record:

@@ -60,7 +60,7 @@ def edges_of(workspace: Workspace) -> list[Edge]:
 
 
 def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr.Dataset:
-    """Average the contact and success of all bounds over replicates; see `Truth.of`."""
+    """Average the contact and success of all bounds over replicates; see `Truth.from_simulator`."""
     if hasattr(simulator, "expected_contact"):
         return simulator.expected_contact()
 

@@ -14,7 +14,7 @@ import xarray as xr
 
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_count, require_whole
+from trustbo.errors import OldName, TrustboError, require_count, require_whole
 from trustbo.files import FilePath, to_json, to_path, write_file
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.paths import AdmissiblePaths
@@ -50,8 +50,10 @@ class Truth(Summary):
         worlds = "one" if self._of is None else "one for each mission; see at(mission)"
         return [("bounds", f"of {rows} x {cols} cells"), ("worlds", worlds)]
 
+    of = OldName("from_simulator")
+
     @classmethod
-    def of(
+    def from_simulator(
         cls,
         simulator: Any,
         *,

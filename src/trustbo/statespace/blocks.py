@@ -26,7 +26,7 @@ class Layout(NamedTuple):
     """Whether all blocks have different matrices."""
 
     @classmethod
-    def of(
+    def from_rates(
         cls,
         y: np.ndarray,
         *,
@@ -138,7 +138,7 @@ class LinearPredictor(NamedTuple):
     """Covariance of shared noise, shape (point, label, row, row), or None."""
 
     @classmethod
-    def of(cls, space: StateSpace, layout: Layout, random: Inputs | None = None) -> Self:
+    def from_space(cls, space: StateSpace, layout: Layout, random: Inputs | None = None) -> Self:
         """Compute the distribution of trust at all bounds from the state-space form.
 
         Args:

@@ -153,7 +153,7 @@ class World:
 
     def truth(self, folder: FilePath | None = None) -> Truth:
         """Return the truth of the simulator; `folder` caches it on disk."""
-        return Truth.of(self.simulator(self.workspace()), folder=folder)
+        return Truth.from_simulator(self.simulator(self.workspace()), folder=folder)
 
     def scene(
         self,
