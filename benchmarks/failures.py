@@ -12,7 +12,7 @@ the product of 1 - p_fail over the bounds. Each campaign has a file in --out, so
 resumed. --jobs sets the number of processes.
 
 The part `price` prints the failure probability of plans on wellington, computed from the product of
-means, from strata, and from all draws.
+means, from components, and from all draws.
 """
 
 import csv
@@ -159,7 +159,7 @@ PRIORS = {
 
 def print_price():
     """Print the failure probability of plans before any mission and after one failure."""
-    table = Table("prior of the margin", "course", "plan", "product", "five strata", "draws")
+    table = Table("prior of the margin", "course", "plan", "product", "five components", "draws")
     workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10), tb.Team())
     courses = {"sw-ne": ((9, 0), (0, 9)), "nw-se": ((0, 0), (9, 9))}
     for (prior, hazard), (course, ends) in product(PRIORS.items(), courses.items()):
@@ -172,8 +172,9 @@ def print_price():
 
 
 def chances(risk, path):
-    """Compute the failure probability of a path from means, from strata, and from 20 000 draws."""
-    joint = [Risk(risk.mean, strata=strata).priced(path) for strata in (None, risk.strata())]
+    """Compute the failure probability of a path from means, components, and 20 000 draws."""
+    risks = Risk(risk.mean), Risk(risk.mean, components=risk.components())
+    joint = [one.priced(path) for one in risks]
     rows, cols = np.array(path[1:]).T
     drawn = risk.draw(20_000, seed=1)[:, moves_along(path), rows, cols]
     return [f"{p:.3f}" for p in (*joint, 1.0 - np.prod(1.0 - drawn, axis=1).mean())]

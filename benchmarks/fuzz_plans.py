@@ -4,7 +4,7 @@
 
 The problems vary the grid (holes, closed bounds), the awareness (of cells or bounds), place
 effects, the model (equal, different or coupled robots), the objective, the family, costs of bounds,
-limits on the number of bounds, U-turns, and risks (limits, costs, strata). Numbers are usual,
+limits on the number of bounds, U-turns, and risks (limits, costs, components). Numbers are usual,
 large, tied or 0. The plan must have the best score of all admissible paths, which
 `peers.every_path` enumerates without code of the planner. With --networkx, the plan must also have
 the value of `planning.reference.plan`. Problem I of a seed is always the same.
@@ -18,7 +18,7 @@ from common import arguments, parsed
 from peers.every_path import STEPS, TooManyError, World, best_walk, score_along, to_goal
 from scipy.special import logit
 
-from trustbo.hazard.strata import Strata
+from trustbo.hazard.components import Components
 from trustbo.models import TrustParams
 from trustbo.models.params import CoupledParams, RobotParams
 from trustbo.planning import InfeasibleError, Planner, reference
@@ -103,10 +103,10 @@ def draw_model(rng, z, kind):
 
 
 def draw_risk(rng, shape, of_contact):
-    """Draw failure probabilities (move, row, col), strata or None, and options of the planner."""
+    """Draw failure probabilities (move, row, col), components or None, and planner options."""
     p = np.where(rng.random(shape) < 0.4, rng.uniform(0.0, 0.5, shape), 0.02)
     p = np.where(rng.random(shape) < 0.1, rng.choice([0.0, 1.0, 0.1], shape), p)
-    strata, options = None, {}
+    components, options = None, {}
     if rng.random() < 0.6:
         options["max_failure"] = float(-np.expm1(-rng.exponential(0.5)))
     if of_contact and rng.random() < 0.6:
@@ -115,17 +115,19 @@ def draw_risk(rng, shape, of_contact):
         n = int(rng.integers(2, 6))
         severity = np.sort(rng.lognormal(0.0, pick(rng, 0.3, 1.5), n))[:, None, None, None]
         noise = rng.lognormal(0.0, pick(rng, 0.0, 0.0, 1.0), (n, *shape))
-        strata = Strata(np.minimum(p * severity * noise, 1.0), rng.dirichlet(np.full(n, 0.7)))
-        p = np.minimum(np.tensordot(strata.shares, strata.p_fail, 1), 1.0)
-    return p, strata, options
+        components = Components(
+            np.minimum(p * severity * noise, 1.0), rng.dirichlet(np.full(n, 0.7))
+        )
+        p = np.minimum(np.tensordot(components.weights, components.p_fail, 1), 1.0)
+    return p, components, options
 
 
-def risks_of(p, strata, cost):
-    """Return risks (sum, move, cell) of each stratum and, last, of the mean, and their costs."""
+def risks_of(p, components, cost):
+    """Return risks (sum, move, cell) of each component and, last, of the mean, and their costs."""
     some, failure = p[None], np.array([cost])
-    if strata is not None and cost > 0.0:
-        some = np.concatenate([strata.p_fail, p[None]])
-        failure = np.append(cost * strata.shares, 0.0)
+    if components is not None and cost > 0.0:
+        some = np.concatenate([components.p_fail, p[None]])
+        failure = np.append(cost * components.weights, 0.0)
     with np.errstate(divide="ignore"):
         risk = np.minimum(-np.log1p(-some), 700.0)
     return risk.reshape(len(some), 8, -1), failure
@@ -148,7 +150,7 @@ def draw_problem(rng):
     shortest, extra = int(to_goal(into, ends[1])[ends[0]]), int(rng.integers(0, 5))
     turns = rng.random() < 0.4
     bound_cost = np.where(rng.random() < 0.5, 0.0, rng.exponential(0.1, (8, *shape)))
-    p, strata, options = (
+    p, components, options = (
         (None, None, {})
         if rng.random() < 0.4
         else draw_risk(rng, (8, *shape), objective == "lost_contact")
@@ -162,9 +164,9 @@ def draw_problem(rng):
         planner = planner.avoiding(closed, np.zeros(closed.shape))
     risk, failure = np.zeros((1, 8, passable.size)), np.zeros(1)
     if p is not None:
-        planner = planner.with_risk(p, None, strata)
+        planner = planner.with_risk(p, None, components)
         cost = options.get("failure_cost", float(shortest)) if objective == "lost_contact" else 0.0
-        risk, failure = risks_of(p, strata, cost)
+        risk, failure = risks_of(p, components, cost)
     limit = -np.log1p(-options["max_failure"]) if "max_failure" in options else np.inf
     return planner, params, World(
         objective, *ends, into, bound_cost.reshape(8, -1), u, B0, x0, family, sd, shortest + extra,

@@ -18,8 +18,8 @@ import numpy as np
 from scipy import special
 
 from trustbo.hazard import Hazard
-from trustbo.hazard.exposures import Exposures
 from trustbo.hazard.model import sample
+from trustbo.hazard.trials import Trials
 
 MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
 PRIORS = {"mixture (default)": Hazard(), "N(1, 4^2)": Hazard(margin=(1.0, 4.0), doubt=(0.0, 4.0))}
@@ -27,7 +27,7 @@ LIMIT, N_BOUNDS, MOVES = np.deg2rad(22.0), 80, 8
 
 
 def simulate(seed):
-    """Simulate the difficulty (bound, measure) and the exposures of one data set."""
+    """Simulate the difficulty (bound, measure) and the trials of one data set."""
     rng = np.random.default_rng(seed)
     difficulty = rng.uniform(0.0, 1.0, (N_BOUNDS, len(MEASURES)))
     steepness = np.rad2deg(np.arctan(difficulty[:, 1] * np.tan(LIMIT)) - LIMIT)
@@ -47,18 +47,18 @@ def simulate(seed):
     bounds = np.column_stack(
         [np.zeros(N_BOUNDS, int), np.arange(N_BOUNDS), np.zeros(N_BOUNDS, int)]
     )
-    return difficulty, Exposures(bounds, n, failed, tuple(lost))
+    return difficulty, Trials(bounds, n, failed, tuple(lost))
 
 
-def log_likelihood(prior, exposures, z):
+def log_likelihood(prior, trials, z):
     """Compute the exact log likelihood of scores, with inclusion-exclusion for lost missions."""
     alpha, beta = prior.betas(z)
-    a, b = alpha + exposures.failed, beta + exposures.n - exposures.failed
-    met = exposures.n > 0.0
+    a, b = alpha + trials.failed, beta + trials.n - trials.failed
+    met = trials.n > 0.0
     log_p = (special.betaln(a, b) - special.betaln(alpha, beta))[:, met].sum(1)
     all_fail = np.zeros(len(z))
-    for chosen in itertools.product([0, 1], repeat=len(exposures.lost)):
-        paths = [path for path, taken in zip(exposures.lost, chosen, strict=True) if taken]
+    for chosen in itertools.product([0, 1], repeat=len(trials.lost)):
+        paths = [path for path, taken in zip(trials.lost, chosen, strict=True) if taken]
         survived = np.ones(len(z))
         for e, count in Counter(np.concatenate([[], *paths]).astype(int)).items():
             for i in range(count):
@@ -67,11 +67,11 @@ def log_likelihood(prior, exposures, z):
     return log_p + np.log(np.maximum(all_fail, 1e-300))
 
 
-def reference(prior, exposures, n, seed):
+def reference(prior, trials, n, seed):
     """Compute the posterior mean of the scores by tempered sequential Monte Carlo."""
     rng, d = np.random.default_rng(seed), len(prior.center)
     z, power = rng.standard_normal((n, d)), 0.0
-    log_l = log_likelihood(prior, exposures, z)
+    log_l = log_likelihood(prior, trials, z)
     while power < 1.0:
 
         def too_far(step, log_l=log_l):
@@ -91,7 +91,7 @@ def reference(prior, exposures, n, seed):
         for k in range(MOVES):
             width = (2.4 if k % 2 else 0.8) / np.sqrt(d)
             new = z + width * rng.standard_normal(z.shape) @ factor.T
-            new_l = log_likelihood(prior, exposures, new)
+            new_l = log_likelihood(prior, trials, new)
             ratio = power * (new_l - log_l) + 0.5 * (z**2 - new**2).sum(1)
             taken = np.log(rng.random(n)) < ratio
             z, log_l = np.where(taken[:, None], new, z), np.where(taken, new_l, log_l)
@@ -107,12 +107,12 @@ def main():
     for name, hazard in PRIORS.items():
         rows = []
         for seed in range(given.sets):
-            difficulty, exposures = simulate(seed)
+            difficulty, trials = simulate(seed)
             prior = hazard.of_bounds(difficulty, MEASURES, LIMIT)
             started = time.process_time()
-            points = sample(prior, exposures, np.random.default_rng(seed))[0]
+            points = sample(prior, trials, np.random.default_rng(seed))[0]
             seconds = time.process_time() - started
-            expected = reference(prior, exposures, given.particles, seed)
+            expected = reference(prior, trials, given.particles, seed)
             off = np.abs(points.weight @ points.z - expected).max()
             rows.append((off, points.k_hat, seconds))
         off, k_hat, seconds = np.array(rows).T

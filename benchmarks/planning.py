@@ -17,7 +17,7 @@ from common import Table, arguments, parsed
 from scipy.ndimage import gaussian_filter
 from scipy.sparse.csgraph import dijkstra
 
-from trustbo.hazard.strata import Strata
+from trustbo.hazard.components import Components
 from trustbo.inference import sample_prior
 from trustbo.models import PooledTrust, TrustParams
 from trustbo.planning import Planner, reference
@@ -64,22 +64,22 @@ def many_draws(table, n, few):
         table.row(f"1000 draws, {n} x {n}, {objective}", f"{took:.2f}", note)
 
 
-def strata_of(n):
-    """Make failure probabilities of n x n cells, in five strata from mild to severe."""
+def components_of(n):
+    """Make failure probabilities of n x n cells, in five components from mild to severe."""
     base = np.random.default_rng(1).uniform(0.0, 0.2 / n, (8, n, n))
     severity = np.array([0.1, 0.4, 1.0, 3.0, 8.0])[:, None, None, None]
-    return Strata(np.minimum(base * severity, 1.0), np.array([0.4, 0.3, 0.15, 0.1, 0.05]))
+    return Components(np.minimum(base * severity, 1.0), np.array([0.4, 0.3, 0.15, 0.1, 0.05]))
 
 
 def one_plan(table, n):
     """Time a plan without a failure cost, with a failure cost, and with `max_failure`."""
-    workspace, strata = workspace_of(n), strata_of(n)
-    mean = np.tensordot(strata.shares, strata.p_fail, 1)
+    workspace, components = workspace_of(n), components_of(n)
+    mean = np.tensordot(components.weights, components.p_fail, 1)
     for family in ("gaussian", "censored"):
         for label, options, risk in (
             ("", {}, None),
-            (", failure cost of one stratum", {}, (mean,)),
-            (", failure cost of five strata", {}, (mean, None, strata)),
+            (", failure cost of one component", {}, (mean,)),
+            (", failure cost of five components", {}, (mean, None, components)),
             (", max_failure", {"max_failure": 0.2, "failure_cost": 0.0}, (mean,)),
         ):
             planner = Planner(workspace, (n - 1, 0), (0, n - 1), family=family, **options)

@@ -111,6 +111,8 @@ RENAMED = {
     "from_features": (lambda w: Priors.of(("a",)), "Priors.of"),
     "from_simulator": (lambda w: Truth.of(None), "Truth.of"),
     "from_space": (lambda w: tb.models.ContactRate.of(None, None), "ContactRate.of"),
+    "components": (lambda w: Planner(w, *ENDS).with_risk(None, strata=None), "strata"),
+    "trials": (lambda w: tb.hazard.BoundRisk.exposures, "BoundRisk.exposures"),
 }
 """Calls with an old name, by the new name, with the old name."""
 HUGE = {

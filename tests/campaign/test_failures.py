@@ -9,9 +9,9 @@ from worlds import ModelSimulator, random_cells
 import trustbo as tb
 from trustbo.campaign.learning import informed_planner
 from trustbo.hazard import Hazard
-from trustbo.hazard.exposures import LostMission
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
+from trustbo.hazard.trials import LostMission
 from trustbo.workspace.moves import moves_along
 
 ENDS = ((3, 0), (0, 3))
@@ -190,9 +190,9 @@ def test_price_after_a_failure_is_joint_over_strata(steep):
     campaign = begin(steep, planner={"failure_cost": 8.0})
     campaign.fail("stuck", where=campaign.ask().path[1])
     problem, path = campaign.planner.problem, campaign.ask().path
-    p, shares = campaign.risk.strata()
+    p, weights = campaign.risk.components()
     rows, cols = np.array(path[1:]).T
-    joint = 8.0 * shares @ (1.0 - np.prod(1.0 - p[:, moves_along(path), rows, cols], axis=1))
+    joint = 8.0 * weights @ (1.0 - np.prod(1.0 - p[:, moves_along(path), rows, cols], axis=1))
     assert problem.failure_along(path) == pytest.approx(joint, rel=1e-12)
     assert joint < 8.0 * (1.0 - problem.risk.survival(path)) - 1e-3
 

@@ -10,9 +10,9 @@ from scipy import special, stats
 import trustbo as tb
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.hazard import Hazard
-from trustbo.hazard.exposures import Exposures, LostMission
 from trustbo.hazard.model import fit_hazard, impute, sample
 from trustbo.hazard.risk import BoundRisk
+from trustbo.hazard.trials import LostMission, Trials
 from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import MOVES
 
@@ -36,12 +36,12 @@ LIMIT = np.deg2rad(22.0)
 ROW = ((0, 0), (0, 1), (0, 2))
 
 
-def exposures(n, failed, lost=()):
-    """Exposures of made-up bounds."""
+def trials(n, failed, lost=()):
+    """Trials of made-up bounds."""
     n = np.array(n, dtype=float)
     bounds = np.column_stack([np.zeros(len(n), int), np.arange(len(n)), np.zeros(len(n), int)])
     paths = tuple(np.array(path) for path in lost)
-    return Exposures(bounds, n, np.array(failed, dtype=float), paths)
+    return Trials(bounds, n, np.array(failed, dtype=float), paths)
 
 
 def law(difficulty):
@@ -54,7 +54,7 @@ def test_known_outcomes_have_the_beta_binomial_likelihood_of_scipy():
     n = np.array([1, 2, 3, 12, 5, 0, 30])
     failed = np.array([0, 1, 3, 0, 2, 0, 11])
     prior = law(rng.uniform(size=(7, 2)))
-    points = sample(prior, exposures(n, failed), rng)[0]
+    points = sample(prior, trials(n, failed), rng)[0]
     alpha, beta = prior.betas(points.z)
     binomial = stats.betabinom.logpmf(failed, n, alpha, beta) - np.log(special.comb(n, failed))
     expected = binomial.sum(1) + stats.norm.logpdf(points.z).sum(1)
@@ -79,7 +79,7 @@ def test_a_bound_is_passed_if_neither_its_difficulty_nor_the_limit_stops_robots(
 def test_imputing_places_integrates_lost_missions_out_as_quadrature_does():
     """Two lost missions that share bounds: E prod_j (1 - prod_e (1 - p_e)) by tensor quadrature."""
     n, failed = [2, 1, 0], [0, 1, 0]
-    data = exposures(n, failed, lost=[[0, 1, 2], [2, 0]])
+    data = trials(n, failed, lost=[[0, 1, 2], [2, 0]])
     of, z = law(np.empty((3, 0))), np.array([[0.7, 0.4]])
     alpha, beta = of.betas(z)
     a, b = alpha + data.failed, beta + data.n - data.failed
@@ -103,7 +103,7 @@ def test_imputing_places_integrates_lost_missions_out_as_quadrature_does():
 
 def test_a_lost_mission_that_enters_a_bound_twice_survived_it_once():
     """1 - E (1 - p)^2 for a path of one bound twice."""
-    data, of, z = exposures([0], [0], lost=[[0, 0]]), law(np.empty((1, 0))), np.zeros((1, 2))
+    data, of, z = trials([0], [0], lost=[[0, 0]]), law(np.empty((1, 0))), np.zeros((1, 2))
     (a,), (b,) = (part[0] for part in of.betas(z))
     expected = 1.0 - b * (b + 1.0) / ((a + b) * (a + b + 1.0))
     log_fail = impute(*of.betas(z), data.lost, np.random.default_rng(0))[1]
@@ -112,7 +112,7 @@ def test_a_lost_mission_that_enters_a_bound_twice_survived_it_once():
 
 def test_posterior_means_equal_those_of_a_grid():
     """One bound that failed in 3 of 8: intercept and strength on a grid."""
-    data, of = exposures([8], [3]), law(np.empty((1, 0)))
+    data, of = trials([8], [3]), law(np.empty((1, 0)))
     points = sample(of, data, np.random.default_rng(0))[0]
     axis = np.linspace(-7.0, 7.0, 401)
     z = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
@@ -183,7 +183,7 @@ def test_the_posterior_of_the_margin_equals_quadrature_with_chances_integrated_o
     tilt = np.tan(np.deg2rad(degrees)) / np.tan(LIMIT)
     n, failed = np.array([2, 2, 3]), np.array([2, 1, 0])
     law = prior.of_bounds(np.column_stack([tilt, narrow]), ("tilt", "narrowness"), LIMIT)
-    points = sample(law, exposures(n, failed), np.random.default_rng(0))[0]
+    points = sample(law, trials(n, failed), np.random.default_rng(0))[0]
     off, width = np.linspace(-24.0, 24.0, 2001), 0.5 * np.linspace(-6.0, 6.0, 201)
     margin, log_width = np.meshgrid(1.0 + off, width, indexing="ij")
     of_margin, base = np.log(mixture(stats.norm.pdf, off, sd, doubt)), -6.0
@@ -212,7 +212,7 @@ def test_failures_teach_a_limit_that_is_four_degrees_too_high():
     of = Hazard().of_bounds(tilt[:, None], ("tilt",), LIMIT)
     n = np.full(12, 3)
     for failed, low, high in ((n * (degrees > 18.0), 3.0, 5.0), (0 * n, -1.5, 0.5)):
-        points = sample(of, exposures(n, failed), np.random.default_rng(0))[0]
+        points = sample(of, trials(n, failed), np.random.default_rng(0))[0]
         assert low < points.weight @ of.values(points.z)[1][:, 0] < high
         assert points.k_hat < 0.7
 
@@ -238,7 +238,7 @@ def test_the_hazard_is_calibrated():
                 continue
             n[path[: k + 1]] += 1
             failed[path[k : k + 1]] += fails.any()
-        data = exposures(n, failed, lost)
+        data = trials(n, failed, lost)
         points, places = sample(of, data, rng)
         assert points.k_hat < 0.7
         chosen = rng.choice(len(points.z), n_ranks - 1, p=points.weight)
@@ -262,7 +262,7 @@ def test_the_hazard_is_calibrated():
 
 def test_missions_count_as_exposures_up_to_where_they_end():
     path = ((0, 0), (0, 1), (0, 2), (1, 2))
-    counted = Exposures.from_missions(
+    counted = Trials.from_missions(
         [mission(path), mission(path, "stuck", 2), mission(path, "aborted", 2)],
         [LostMission(path, (0, 1)), LostMission(path)],
     )

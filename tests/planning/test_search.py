@@ -7,7 +7,7 @@ from fuzz_plans import draw_problem, faults
 from peers.every_path import TooManyError, best_walk
 
 from trustbo.errors import TrustboError
-from trustbo.hazard.strata import Strata
+from trustbo.hazard.components import Components
 from trustbo.models import TrustParams
 from trustbo.planning import OBJECTIVES, InfeasibleError, Planner, reference
 from trustbo.planning.objectives import Objective
@@ -98,7 +98,7 @@ def test_bounds_that_fail_together_are_priced_as_one_failure(workspace):
     """Half of the draws fail every bound: a price of F / 2, whatever the number of bounds."""
     p = np.array([0.0, 1.0])[:, None, None, None] * np.ones((8, 4, 4))
     planner = Planner(workspace, *ENDS, failure_cost=8.0)
-    plan = planner.with_risk(p.mean(0), None, Strata(p, np.array([0.5, 0.5]))).plan(PARAMS)
+    plan = planner.with_risk(p.mean(0), None, Components(p, np.array([0.5, 0.5]))).plan(PARAMS)
     assert plan.value == pytest.approx(planner.plan(PARAMS).value - 4.0, rel=1e-12)
     assert planner.with_failure_cost(0.0).with_risk(p.mean(0)).plan(PARAMS).path == plan.path
 

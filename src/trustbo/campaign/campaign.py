@@ -36,7 +36,7 @@ from trustbo.errors import (
 )
 from trustbo.files import FilePath, holding_interrupts, interpreting, to_json
 from trustbo.hazard import Hazard
-from trustbo.hazard.exposures import CAUSES
+from trustbo.hazard.trials import CAUSES
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.fit import SAMPLERS
 from trustbo.models.model import TrustModel

@@ -7,9 +7,9 @@ from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, State
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError, warn
 from trustbo.hazard import Hazard
-from trustbo.hazard.exposures import LostMission
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
+from trustbo.hazard.trials import LostMission
 from trustbo.inference import fit
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import PlaceEffect
@@ -134,8 +134,8 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     A bound that failed twice is avoided unless there is no other path, or its failure probability
     has fallen below 0.2. Before the first failure, the user's slope limit is trusted, and failures
     have no cost unless the user gave `failure_cost`. Under the prior alone, a cost would rule out
-    longer paths that keep contact and never fail. The cost is computed jointly over strata of the
-    hazard posterior, since all bounds share the slope limit.
+    longer paths that keep contact and never fail. The cost is computed jointly over components of
+    the hazard posterior, since all bounds share the slope limit.
     """
     n_failures = risk.stopped + 1e-9  # expected numbers, with rounding errors
     stopped = (n_failures >= _STOPPED) & ~(risk.mean < _RECOVERED)
@@ -146,5 +146,5 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
         planner = planner.with_failure_cost(0.0)
 
     priced = planner.problem.objective.of_contact and planner.problem.failure_cost != 0.0
-    strata = risk.strata() if priced else None
-    return planner.with_risk(risk.mean, risk.draw(_N_RISKS), strata)
+    components = risk.components() if priced else None
+    return planner.with_risk(risk.mean, risk.draw(_N_RISKS), components)

@@ -61,7 +61,7 @@ class RegretBound:
 
         risk = campaign.risk
         bounds = tuple(bounds_along(np.array(campaign.recommend().path)).T)
-        was_completed = risk.exposures[bounds] > risk.failures[bounds]
+        was_completed = risk.trials[bounds] > risk.failures[bounds]
         if not was_completed.all():
             return None
         return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"

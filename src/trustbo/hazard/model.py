@@ -23,9 +23,9 @@ from scipy import special, stats
 
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError, require_whole
-from trustbo.hazard.exposures import Exposures, LostMission
 from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, TILT, BoundPrior, Hazard
 from trustbo.hazard.risk import BoundRisk, add_lost
+from trustbo.hazard.trials import LostMission, Trials
 from trustbo.inference import importance
 from trustbo.parallel import computing
 from trustbo.workspace import Workspace
@@ -76,7 +76,7 @@ def fit_hazard(
         `coefficient` (draw, measure), `strength` (draw) and, with a terrain, `margin` and `width`
         (draw) of the slope limit in degrees. `place` (draw, lost) is the number, from 1, of the
         bound at which each mission lost at an unknown place failed. `p_fail` (move, row, col) is
-        the posterior mean failure probability, and NaN where there is no bound. `exposures` and
+        the posterior mean failure probability, and NaN where there is no bound. `trials` and
         `failures` (move, row, col) count known outcomes. `BoundRisk` draws failure probabilities.
 
     Raises:
@@ -85,24 +85,24 @@ def fit_hazard(
     """
     started = time.perf_counter()
     hazard = hazard or Hazard()
-    exposures = Exposures.from_missions(missions, lost)
+    trials = Trials.from_missions(missions, lost)
     difficulty = difficulty_of(workspace)
 
     shape = difficulty.shape[1:3]
-    cells = exposures.bounds[:, 1:]
+    cells = trials.bounds[:, 1:]
     outside = ((cells < 0) | (cells >= shape)).any(1)
     if outside.any():
         cell = tuple(cells[outside][0].tolist())
         raise TrustboError(f"a mission enters {cell}, outside the workspace of shape {shape}.")
 
     # A bound that was driven but does not exist on the map has the largest difficulty.
-    met = np.nan_to_num(difficulty.values[*exposures.bounds.T], nan=1.0)
+    met = np.nan_to_num(difficulty.values[*trials.bounds.T], nan=1.0)
     measures = difficulty["measure"].values.tolist()
     prior = hazard.of_bounds(met, measures, workspace.team.max_slope)
     rng = np.random.default_rng(require_whole("seed", seed, 0))
-    points, places = sample(prior, exposures, rng)
+    points, places = sample(prior, trials, rng)
 
-    group = _to_dataset(prior, exposures, points, places, difficulty, seed)
+    group = _to_dataset(prior, trials, points, places, difficulty, seed)
     k_hat = float(np.clip(points.k_hat, -1.0, _LARGEST_KHAT))
     group.attrs = {"k_hat": k_hat, "kish": points.kish, "seed": seed}
     group.attrs |= {f"prior_{name}": list(value) for name, value in asdict(hazard).items()}
@@ -117,12 +117,12 @@ def fit_hazard(
 
 
 def sample(
-    prior: BoundPrior, exposures: Exposures, rng: np.random.Generator
+    prior: BoundPrior, trials: Trials, rng: np.random.Generator
 ) -> tuple[importance.Points, np.ndarray]:
     """Draw weighted points and, for each point, the bound at which each lost mission failed."""
-    n = exposures.n
-    failed = exposures.failed
-    paths = exposures.lost
+    n = trials.n
+    failed = trials.failed
+    paths = trials.lost
     counts, kind = np.unique(n, return_inverse=True)
     times = np.bincount(kind, minlength=len(counts))
     bad = failed > 0.0
@@ -256,7 +256,7 @@ def _lookahead(
 
 def _to_dataset(
     prior: BoundPrior,
-    exposures: Exposures,
+    trials: Trials,
     points: importance.Points,
     places: np.ndarray,
     difficulty: xr.DataArray,
@@ -274,13 +274,13 @@ def _to_dataset(
     }
 
     n, failed = np.zeros((2, *difficulty.shape[:3]))
-    n[*exposures.bounds.T] = exposures.n
-    failed[*exposures.bounds.T] = exposures.failed
+    n[*trials.bounds.T] = trials.n
+    failed[*trials.bounds.T] = trials.failed
 
-    longest = max((len(path) for path in exposures.lost), default=0)
-    lost = np.full((len(exposures.lost), longest, 3), -1)
-    for j, path in enumerate(exposures.lost):
-        lost[j, : len(path)] = exposures.bounds[path]
+    longest = max((len(path) for path in trials.lost), default=0)
+    lost = np.full((len(trials.lost), longest, 3), -1)
+    for j, path in enumerate(trials.lost):
+        lost[j, : len(path)] = trials.bounds[path]
 
     return xr.Dataset(
         {
@@ -290,7 +290,7 @@ def _to_dataset(
             "strength": ("draw", strength),
             "place": (("draw", "lost"), places[chosen] + 1),
             "lost_bound": (("lost", "bound", "axis"), lost),
-            "exposures": (_MAPS, n),
+            "trials": (_MAPS, n),
             "failures": (_MAPS, failed),
         },
         {

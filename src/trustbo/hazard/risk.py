@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_whole
+from trustbo.errors import OldName, Renamed, TrustboError, require_whole
+from trustbo.hazard.components import Components, partition
 from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, TILT, prior_betas, steepness_of
-from trustbo.hazard.strata import Strata, partition
 from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import bounds_along
@@ -34,16 +34,19 @@ class BoundRisk:
 
     Attributes:
         exists: Whether each bound exists, shape (move, row, col).
-        exposures: Number of exposures with a known outcome, shape (move, row, col).
+        trials: Number of trials with a known outcome, shape (move, row, col).
         failures: Number of failures at a known bound, shape (move, row, col).
         steepness: Degrees by which each bound exceeds the stated slope limit, shape (move, row,
             col), or None without a limit.
     """
 
+    exposures = OldName("trials")
+    strata = OldName("components")
+
     def __init__(self, hazard: xr.Dataset, workspace: Workspace) -> None:
         """Read the group `hazard` of a posterior (see `fit_hazard`) for a workspace."""
         self.exists = workspace.passable_bounds.values
-        self.exposures = hazard["exposures"].values
+        self.trials = hazard["trials"].values
         self.failures = hazard["failures"].values
 
         difficulty = difficulty_of(workspace)
@@ -107,10 +110,10 @@ class BoundRisk:
             out.reshape(n, -1)[:, bounds] = rng.beta(a, b)
         return out
 
-    def strata(self, n: int = 5) -> Strata:
-        """Average the failure probabilities within at most `n` groups of draws (see `Strata`).
+    def components(self, n: int = 5) -> Components:
+        """Average the failure probabilities within at most `n` groups of draws (see `Components`).
 
-        The mean of the groups, weighted by their shares, equals the mean over all draws.
+        The mean of the groups, weighted by their sizes, equals the mean over all draws.
         """
         order = np.argsort(self._severity)
         ends = partition(self._severity[order], require_whole("n", n, 1))
@@ -124,7 +127,7 @@ class BoundRisk:
         p_fail = np.full((len(ends), *self.exists.shape), np.nan)
         for bounds, a, b in self._betas():
             p_fail.reshape(len(ends), -1)[:, bounds] = weights @ (a / (a + b))
-        return Strata(p_fail, sizes / sizes.sum())
+        return Components(p_fail, sizes / sizes.sum())
 
     @cached_property
     def _severity(self) -> np.ndarray:
@@ -155,7 +158,7 @@ class BoundRisk:
             steepness,
         )
 
-        n = self.exposures.ravel()[bounds]
+        n = self.trials.ravel()[bounds]
         failed = self.failures.ravel()[bounds]
         a = a + failed
         b = b + n - failed
@@ -178,6 +181,7 @@ def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) 
             b[:, e] += place > k
 
 
+@Renamed(strata="components")
 @dataclass(frozen=True, eq=False)
 class Risk:
     """Probability that each bound of a workspace ends the mission.
@@ -186,7 +190,7 @@ class Risk:
         p_fail: Posterior mean, shape (move, row, col), with moves as in `MOVES`; NaN where there
             is no bound.
         draws: Posterior draws, shape (draw, move, row, col), or None.
-        strata: Mean failure probabilities of groups of draws, used for the expected cost of
+        components: Mean failure probabilities of groups of draws, used for the expected cost of
             failure. If None, bounds are assumed to fail independently with probability `p_fail`.
 
     Raises:
@@ -195,10 +199,11 @@ class Risk:
 
     p_fail: np.ndarray
     draws: np.ndarray | None = None
-    strata: Strata | None = None
+    components: Components | None = None
 
     def __post_init__(self) -> None:
-        more = {"draws": self.draws, "strata": None if self.strata is None else self.strata.p_fail}
+        of_components = None if self.components is None else self.components.p_fail
+        more = {"draws": self.draws, "components": of_components}
         for name, p in {"p_fail": self.p_fail[None], **more}.items():
             if p is None:
                 continue
@@ -216,12 +221,12 @@ class Risk:
         return float(np.prod(1.0 - self.p_fail[*bounds_along(path).T]))
 
     def priced(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Compute the failure probability of a path, averaged over strata, for `failure_cost`."""
-        if self.strata is None:
+        """Average the failure probability of a path over components, for `failure_cost`."""
+        if self.components is None:
             return 1.0 - self.survival(path)
-        p_fail, shares = self.strata
+        p_fail, weights = self.components
         p = p_fail[:, *bounds_along(path).T]
-        return float(shares @ (1.0 - np.prod(1.0 - p, axis=1)))
+        return float(weights @ (1.0 - np.prod(1.0 - p, axis=1)))
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
         """Compute the risk along a path."""

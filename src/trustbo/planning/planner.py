@@ -15,8 +15,8 @@ from trustbo.arrays import read_labelled
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import Renamed, TrustboError, require_choice, require_positive
+from trustbo.hazard.components import Components
 from trustbo.hazard.risk import Risk
-from trustbo.hazard.strata import Strata
 from trustbo.models.families import FAMILIES
 from trustbo.models.params import Params
 from trustbo.parallel import computing
@@ -157,11 +157,12 @@ class Planner(Summary):
 
         return self._with(paths=self.problem.paths.avoiding(avoided > 0.0, risks))
 
+    @Renamed(strata="components")
     def with_risk(
         self,
         p_fail: ArrayLike,
         draws: ArrayLike | None = None,
-        strata: Strata | None = None,
+        components: Components | None = None,
     ) -> Self:
         """Return a planner with the given failure probability of each bound.
 
@@ -171,8 +172,9 @@ class Planner(Summary):
         Args:
             p_fail: Posterior mean, shape (move, row, col); NaN where there is no bound.
             draws: Posterior draws, shape (draw, move, row, col), for `p_arrive` and its 90 % band.
-            strata: Mean failure probabilities of groups of draws, such as `BoundRisk.strata()`, for
-                the expected cost of failure. By default, bounds fail independently with `p_fail`.
+            components: Mean failure probabilities of groups of draws, such as
+                `BoundRisk.components()`, for the expected cost of failure. By default, bounds fail
+                independently with `p_fail`.
 
         Raises:
             TrustboError: If the shapes do not match, or a probability is outside [0, 1].
@@ -181,7 +183,7 @@ class Planner(Summary):
         drawn = None
         if draws is not None:
             drawn = read_labelled("draws", draws, ("draw", *_DIMS), _MOVE_LABELS).values
-        return self._with(risk=Risk(mean, drawn, strata))
+        return self._with(risk=Risk(mean, drawn, components))
 
     def with_failure_cost(self, failure_cost: float) -> Self:
         """Return a planner with another failure cost, in bounds.

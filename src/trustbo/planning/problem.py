@@ -162,18 +162,18 @@ class Problem:
         if self.risk is None or (self.max_failure is None and self.price == 0.0):
             return None
 
-        if self.risk.strata is not None and self.price > 0.0:
-            p_fail, shares = self.risk.strata
+        if self.risk.components is not None and self.price > 0.0:
+            p_fail, weights = self.risk.components
         else:
             p_fail = self.risk.p_fail[None]
-            shares = np.ones(1)
+            weights = np.ones(1)
 
         limit = np.inf
         if self.max_failure is not None:
             limit = -np.log1p(-self.max_failure) + ROUNDING
-            if len(shares) > 1:  # the last sum is for the mean of the strata
+            if len(weights) > 1:  # the last sum is for the mean of the components
                 p_fail = np.concatenate([p_fail, self.risk.p_fail[None]])
-                shares = np.append(shares, 0.0)
+                weights = np.append(weights, 0.0)
 
         missing = np.isnan(p_fail).any(0) & self.paths.bounds
         if missing.any():
@@ -184,7 +184,7 @@ class Problem:
             )
 
         of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
-        return Risks(np.ascontiguousarray(of_bounds), self.price * shares, limit)
+        return Risks(np.ascontiguousarray(of_bounds), self.price * weights, limit)
 
     def best(self, recursion: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the best admissible path for each draw of the recursion, or for a single draw.
@@ -274,10 +274,10 @@ class Problem:
 class Risks(NamedTuple):
     """Risks -log(1 - p_fail) of the bounds, which the search sums along a path.
 
-    `of_bounds` (bound, sum) has one column per stratum of the risk and, with several strata and a
-    limit, one for their mean. A path whose risks add up to r_m in column m has the expected failure
-    cost sum_m F_m (1 - exp(-r_m)), where `failure` (sum,) contains the F_m. `limit` is the largest
-    value allowed for the sum of the last column.
+    `of_bounds` (bound, sum) has one column per component of the risk and, with several components
+    and a limit, one for their mean. A path whose risks add up to r_m in column m has the expected
+    failure cost sum_m F_m (1 - exp(-r_m)), where `failure` (sum,) contains the F_m. `limit` is the
+    largest value allowed for the sum of the last column.
     """
 
     of_bounds: np.ndarray

@@ -1,12 +1,13 @@
-"""Strata: a small mixture of failure probabilities that replaces the posterior in path searches.
+"""A mixture of few components, which replaces the posterior of failures in path searches.
 
 Failures of bounds are correlated because the bounds share an uncertain slope limit. Given the
 hyperparameters, bounds fail independently, so a path fails with probability
 
     E[1 - prod_k (1 - p_k)] = mean over draws of 1 - prod_k (1 - E[p_k | draw]).
 
-Strata are groups of draws, ordered from low to high failure probabilities. Each group is treated as
-one draw with the mean probabilities of its members, so a search needs only one sum per stratum.
+A component is a group of draws; they are ordered from low to high failure probabilities. Each group
+is treated as one draw with the mean probabilities of its members, so a search needs only one sum
+per component.
 """
 
 from typing import NamedTuple
@@ -14,13 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 
-class Strata(NamedTuple):
+class Components(NamedTuple):
     """Failure probabilities in each group of draws."""
 
     p_fail: np.ndarray
-    """Mean failure probability, shape (stratum, move, row, col); NaN where there is no bound."""
-    shares: np.ndarray
-    """Share of the draws in each stratum, shape (stratum,); the shares sum to 1."""
+    """Mean failure probability, shape (component, move, row, col); NaN where there is no bound."""
+    weights: np.ndarray
+    """Fraction of the draws in each component, shape (component,); the weights sum to 1."""
 
 
 def partition(values: np.ndarray, n: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Strata of a posterior: optimal groups, and the chance that a path fails under them."""
+"""Components of a posterior: optimal groups, and the chance that a path fails under them."""
 
 import itertools
 
@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import trustbo as tb
-from trustbo.hazard.exposures import LostMission
+from trustbo.hazard.components import partition
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
-from trustbo.hazard.strata import partition
+from trustbo.hazard.trials import LostMission
 
 
 def squares(values, ends):
@@ -48,19 +48,19 @@ def risk():
 
 def test_mean_over_strata_is_that_over_all_draws(risk):
     risk, _ = risk
-    strata = risk.strata()
-    assert len(strata.shares) == 5
-    np.testing.assert_allclose(strata.shares.sum(), 1.0, rtol=1e-12)
-    mean = np.tensordot(strata.shares, strata.p_fail, 1)
+    components = risk.components()
+    assert len(components.weights) == 5
+    np.testing.assert_allclose(components.weights.sum(), 1.0, rtol=1e-12)
+    mean = np.tensordot(components.weights, components.p_fail, 1)
     np.testing.assert_allclose(mean, risk.mean, rtol=1e-9)
-    severity = np.nanmean(strata.p_fail.reshape(5, -1), axis=1)
+    severity = np.nanmean(components.p_fail.reshape(5, -1), axis=1)
     assert (np.diff(severity) > 0.0).all()
 
 
 def test_few_strata_have_the_chance_to_fail_that_all_draws_have(risk):
     """Against 10 000 draws of the chances themselves; the product of means is far above."""
     risk, path = risk
-    planner_risks = [tb.hazard.risk.Risk(risk.mean, strata=risk.strata(n)) for n in (1, 5)]
+    planner_risks = [tb.hazard.risk.Risk(risk.mean, components=risk.components(n)) for n in (1, 5)]
     product, five = (of_path.priced(path) for of_path in planner_risks)
     rows, cols = np.array(path[1:]).T
     drawn = 1.0 - np.prod(1.0 - risk.draw(10_000, seed=1)[:, 2, rows, cols], axis=1)

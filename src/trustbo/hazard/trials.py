@@ -1,4 +1,4 @@
-"""Exposures of bounds: how often each bound was begun and how often it ended a mission."""
+"""Trials of bounds: how often each bound was begun and how often it ended a mission."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -26,14 +26,14 @@ class LostMission(NamedTuple):
     where: Cell | None = None
 
 
-class Exposures(NamedTuple):
-    """Exposures of attempted bounds, which are sufficient statistics of the hazard model.
+class Trials(NamedTuple):
+    """Trials of attempted bounds, which are sufficient statistics of the hazard model.
 
     Attributes:
         bounds: Distinct bounds in lexicographic order, shape (bound, 3). The columns are the index
             of the move in `MOVES` and the row and column of the cell entered.
-        n: Number of exposures with a known outcome, shape (bound,).
-        failed: Number of failures among the exposures in `n`, shape (bound,).
+        n: Number of trials with a known outcome, shape (bound,).
+        failed: Number of failures among the trials in `n`, shape (bound,).
         lost: Planned bounds of each mission lost at an unknown place, as indices into `bounds`.
     """
 
@@ -44,7 +44,7 @@ class Exposures(NamedTuple):
 
     @classmethod
     def from_missions(cls, missions: Sequence[Mission], lost: Sequence[LostMission] = ()) -> Self:
-        """Count the exposures in measured missions and in lost missions.
+        """Count the trials in measured missions and in lost missions.
 
         The last bound of a failed mission counts as a failure. An aborted bound is not counted.
 
