@@ -108,7 +108,7 @@ def test_likelihoods_are_those_of_a_chain_of_deviations(deviations):
         z, expected = mission.awareness, 0.0
         for i in range(3):
             u = z[:, i] @ draws["beta"].values + float(draws["b"])
-            u = u + d[j, i] * z[:, i, 0] + place[:, 0]
+            u = u + d[j, i] * z[:, i, 0] + place[0]
             y = mission.contact_rate[:, i] - u
             no = np.zeros((len(y), 1))
             beta0 = float(draws["beta0"])

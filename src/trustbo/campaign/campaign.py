@@ -15,7 +15,6 @@ from trustbo.campaign.record import RECORD
 from trustbo.campaign.result import Result, in_a_line
 from trustbo.campaign.settings import (
     name_of,
-    require_model,
     require_options,
     require_options_of_fit,
     to_arguments,
@@ -38,9 +37,7 @@ from trustbo.files import FilePath, holding_interrupts, interpreting, to_json
 from trustbo.hazard import Hazard
 from trustbo.hazard.trials import CAUSES
 from trustbo.inference.diagnostics import diagnostics
-from trustbo.inference.fit import SAMPLERS
-from trustbo.models.model import TrustModel
-from trustbo.models.record import model_from_record
+from trustbo.inference.learner import Model, learner_from_record, learner_of
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.policies import POLICIES, Policy, resolve_policy
 from trustbo.simulation import KinematicSimulator
@@ -78,10 +75,10 @@ class Campaign(Result):
         start: Location,
         goal: Location,
         *,
-        model: TrustModel | None = None,
+        model: Model | None = None,
         policy: str | Policy = "greedy",
         objective: str = "lost_contact",
-        sampler: str = "importance",
+        sampler: str | None = None,
         seed: int = 0,
         directory: FilePath | None = None,
         overwrite: bool = False,
@@ -96,11 +93,12 @@ class Campaign(Result):
             workspace: Workspace of the paths.
             start: First cell of every path, or a position in this cell; see `Workspace.locate`.
             goal: Last cell of every path, or a position in this cell.
-            model: Trust model; by default `models.default_model()`, with place and robot effects.
+            model: Trust model, or a NumPyro function `model(awareness, contact_rate=None)`; by
+                default `models.default_model()`, with place and robot effects.
             policy: Name in `planning.POLICIES`, or a callable `policy(rng, draws, planner)` that
                 returns a Plan.
             objective: Objective of the paths; see `planning.Planner`.
-            sampler: Sampler of the posterior; see `trustbo.fit`.
+            sampler: Sampler of the posterior; by default as in `trustbo.fit`.
             seed: Seed of all random numbers.
             directory: Folder that is updated after each mission. It stays locked until `close` is
                 called, the `with campaign:` block exits, or the process ends.
@@ -121,19 +119,21 @@ class Campaign(Result):
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         require_choice("initial", initial, ("prior_mean", "prior_draw"))
-        require_choice("sampler", sampler, SAMPLERS)
         hazard = Hazard() if hazard is None else hazard
         require_kind("hazard", hazard, Hazard, "give a trustbo.hazard.Hazard")
         options = require_options("planner", planner)
         fit_options = require_options("fit", fit)
         require_options_of_fit(fit_options)
-        model = require_model(model)
+        learner = learner_of(model, workspace)
+        if sampler is None:
+            sampler = learner.samplers[0]
+        require_choice("sampler", sampler, learner.samplers)
 
         self.policy = resolve_policy(policy)
-        base = Planner(workspace, start, goal, objective, family=model.family, **options)
+        base = Planner(workspace, start, goal, objective, family=learner.family, **options)
         settings = to_settings(
             base,
-            model,
+            learner,
             policy,
             objective=objective,
             sampler=sampler,
@@ -145,7 +145,7 @@ class Campaign(Result):
         )
 
         state = State(settings)
-        super().__init__(workspace, state, model, base)
+        super().__init__(workspace, state, learner, base)
 
         self._progress = True  # of fits
         self._has_warned_of_risk = False
@@ -207,7 +207,7 @@ class Campaign(Result):
         tree = None
         reason = ""
         if n_used:
-            tree, reason = learn(state, self.model, self.workspace, state.due, self._progress)
+            tree, reason = learn(state, self.learner, self.workspace, state.due, self._progress)
         hazard = self.hazard  # does not depend on what was learned about trust
 
         with holding_interrupts():
@@ -574,7 +574,7 @@ class Campaign(Result):
 
     @classmethod
     def load(
-        cls, directory: FilePath, *, model: TrustModel | None = None, policy: Policy | None = None
+        cls, directory: FilePath, *, model: Model | None = None, policy: Policy | None = None
     ) -> Self:
         """Load a campaign from its folder, lock the folder, and continue where it stopped.
 
@@ -582,7 +582,8 @@ class Campaign(Result):
 
         Args:
             directory: Folder that was passed as `directory`, or to `Result.save`.
-            model: Model of the campaign; required if the model or its priors are custom.
+            model: Model of the campaign; required if the model or its priors are custom, or if it
+                is a NumPyro function.
             policy: Policy of the campaign; required if it is a custom function.
 
         Raises:
@@ -601,7 +602,7 @@ class Campaign(Result):
                     )
                 campaign = cls(
                     workspace,
-                    model=model_from_record(given["model_record"], model),
+                    model=learner_from_record(given["model_record"], model).model,
                     policy=given["policy"] if policy is None else policy,
                     **to_arguments(given),
                 )

@@ -45,12 +45,15 @@ class Follower:
         self.running = False
 
         n_robots = self._workspace.team.n_robots
-        family = campaign.model.family
-        posterior = campaign.state.posterior
-        if posterior is not None:
-            start = TrustFilter(posterior, workspace=self._workspace)
-        else:
-            start = TrustFilter(campaign.draw_prior(_N_DRAWS), n_robots, family=family)
+        draws = campaign.forecast
+        if campaign.state.posterior is None:
+            draws = campaign.draw_prior(_N_DRAWS)
+        start = TrustFilter(
+            draws,
+            n_robots,
+            family=campaign.learner.family,
+            workspace=self._workspace,
+        )
 
         # `_before` has the bounds that have ended, and `_now` also the bound in progress.
         self._before = self._now = start

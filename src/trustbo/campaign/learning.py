@@ -10,17 +10,10 @@ from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import LostMission
-from trustbo.inference import fit
-from trustbo.inference.tree import parameters_alone
-from trustbo.models import PlaceEffect
-from trustbo.models.model import TrustModel
+from trustbo.inference.learner import Learner
 from trustbo.planning import Planner
 from trustbo.workspace import Workspace
 
-_N_DRAWS = 1000
-"""Posterior draws of the trust parameters."""
-_N_PLACE_DRAWS = 250
-"""The same with place effects, whose draws are large, from the importance sampler."""
 _N_RISKS = 200
 """Posterior draws of the failure probabilities."""
 _STOPPED = 2
@@ -56,7 +49,7 @@ def is_excluded_by_user(entry: Entry) -> bool:
 
 
 def learn(
-    state: State, model: TrustModel, workspace: Workspace, seed: int, progress: bool
+    state: State, learner: Learner, workspace: Workspace, seed: int, progress: bool
 ) -> tuple[xr.DataTree | None, str]:
     """Fit the posterior of the parameters to all missions that are not excluded.
 
@@ -68,25 +61,15 @@ def learn(
     """
     used = state.indices(TOLD, LEARNED)
     missions = [state.entries[j].mission for j in used]
-    sampler = state.settings["sampler"]
-    options = state.settings["fit"]
-
-    # Importance draws are independent, so fewer suffice than of a chain.
-    has_places = any(isinstance(effect, PlaceEffect) for effect in model.effects)
-    few = sampler == "importance" and has_places
-    usual = {"draws": _N_PLACE_DRAWS if few else _N_DRAWS}
-
     try:
-        tree = fit(
+        tree = learner.fit(
             missions,
-            model,
-            sampler=sampler,
             workspace=workspace,
+            sampler=state.settings["sampler"],
             seed=seed,
             progress=progress,
-            latent=False,
             start=_previous(state),
-            **(usual | options),
+            **state.settings["fit"],
         )
     except TrustboError as error:
         return None, getattr(error, "reason", str(error))
@@ -95,7 +78,6 @@ def learn(
             raise error.__cause__ from None
         return None, f"{type(error).__name__}: {error}"
 
-    tree = parameters_alone(tree)
     tree.attrs["missions"] = used
     return tree, ""
 

@@ -6,7 +6,7 @@ from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.stopping import Stop
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath
-from trustbo.models.model import TrustModel
+from trustbo.inference.learner import Model
 from trustbo.planning.policies import Policy
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
@@ -71,7 +71,7 @@ def resume(
     *,
     simulator: Simulator | None = None,
     n_iterations: int | None = None,
-    model: TrustModel | None = None,
+    model: Model | None = None,
     policy: Policy | None = None,
     stop: Stop | None = None,
     progress: bool = True,

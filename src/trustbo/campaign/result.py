@@ -21,12 +21,10 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_kind
 from trustbo.files import FilePath, interpreting, to_path
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference import add_latent, params_of, sample_prior
-from trustbo.inference.draws import prior_mean
+from trustbo.inference.functions.function import is_of_function
+from trustbo.inference.learner import ClassLearner, Learner, Model, learner_from_record
 from trustbo.models.backend import VERSIONS
-from trustbo.models.model import TrustModel
-from trustbo.models.params import Params
-from trustbo.models.record import model_from_record
+from trustbo.models.draws import Draws
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.simulation import Truth
 from trustbo.workspace import Workspace
@@ -55,16 +53,14 @@ class Result(Summary):
     Attributes:
         workspace: Workspace of the campaign.
         state: Missions with their plans and posteriors, failures, and settings.
-        model: Trust model; None if it is custom and the result was read from files.
+        learner: The model, as campaigns use it.
     """
 
-    def __init__(
-        self, workspace: Workspace, state: State, model: TrustModel | None, base: Planner
-    ) -> None:
+    def __init__(self, workspace: Workspace, state: State, learner: Learner, base: Planner) -> None:
         """Store the state of a campaign; `base` is its planner before any learning."""
         self.workspace = workspace
         self.state = state
-        self.model: Any = model
+        self.learner = learner
         self._base = base
         self._turn = threading.RLock()
         self._computed: dict[str, Any] = {}
@@ -134,8 +130,7 @@ class Result(Summary):
             )
 
         indices = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
-        # The group `log_prior` requires the model if its priors are not the defaults.
-        whole = add_latent(stored, [self.missions[j] for j in indices], model=self.model)
+        whole = self.learner.add_latent(stored, [self.missions[j] for j in indices])
 
         for group in whole.children.values():
             if "mission" in group.dims:
@@ -143,27 +138,34 @@ class Result(Summary):
         whole["hazard"] = xr.DataTree(self.hazard)
         return whole
 
+    @property
+    def model(self) -> Any:
+        """Trust model or NumPyro function; None if it is custom and was read from files."""
+        model: Any = getattr(self.learner, "model", None)
+        return getattr(model, "function", model)
+
     @computed
-    def belief(self) -> Params:
+    def belief(self) -> Draws:
         """Parameter draws of the last posterior, or of the prior before anything was learned."""
         posterior = self.state.posterior
         if posterior is not None:
-            return params_of(posterior)
+            return self.learner.draws(posterior, self.workspace)
         if self.state.settings["initial"] == "prior_draw":
             return self.draw_prior(1)
+        return self.learner.prior_mean(self.workspace)
 
-        features = self.workspace.features
-        n_robots = self.workspace.team.n_robots
-        model = self.model.for_features(features)
-        return prior_mean(model, len(features), n_robots=n_robots).flat()
+    @computed
+    def forecast(self) -> Draws:
+        """Draws like `belief`, with effects drawn for the next mission, for bands."""
+        posterior = self.state.posterior
+        if posterior is None:
+            return self.belief
+        return self.learner.draws(posterior, self.workspace, next_mission=True)
 
-    def draw_prior(self, n_draws: int) -> Params:
+    def draw_prior(self, n_draws: int) -> Draws:
         """Draw parameters from the prior, with a leading axis (draw,)."""
-        features = self.workspace.features
-        n_robots = self.workspace.team.n_robots
         seed = State(self.state.settings).seed_of("prior")
-        model = self.model.for_features(features)
-        return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots).flat()
+        return self.learner.prior_draws(n_draws, seed, self.workspace)
 
     @computed
     def hazard(self) -> xr.Dataset:
@@ -195,8 +197,7 @@ class Result(Summary):
     def plan(self) -> Plan:
         """Recommended plan, the best under the posterior mean, with posterior credible bands."""
         best = self.recommend()
-        draws = self.state.posterior or self.belief  # a posterior includes robot effects
-        return best.with_draws(self.planner.evaluate(best.path, draws))
+        return best.with_draws(self.planner.evaluate(best.path, self.forecast))
 
     @property
     def path(self) -> list[Cell]:
@@ -316,13 +317,15 @@ class Result(Summary):
             FolderStorage.begin(directory, self.workspace, state, overwrite=overwrite).close()
 
 
-def load_result(directory: FilePath) -> Result:
+def load_result(directory: FilePath, *, model: Model | None = None) -> Result:
     """Read the result of a campaign from its folder, without locking the folder.
 
     The campaign may still be running in another process.
 
     Args:
         directory: Folder of a campaign, or a folder written by `Result.save`.
+        model: Model of the campaign; needed if it is a NumPyro function, or custom and nothing has
+            been learned.
 
     Raises:
         TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is
@@ -339,14 +342,15 @@ def load_result(directory: FilePath) -> Result:
     with interpreting(to_path(directory) / RECORD):
         given = state.settings
         try:
-            model = model_from_record(given["model_record"])
-        except TrustboError:  # a custom model is needed only if nothing has been learned
-            if state.last is None:
+            learner = learner_from_record(given["model_record"], model)
+        except TrustboError:
+            # A model class with custom priors is needed only if nothing has been learned.
+            if state.last is None or model is not None or is_of_function(given["model_record"]):
                 raise
-            model = None
+            learner = ClassLearner(None)
         base = to_planner(given, workspace)
 
-    return Result(workspace, state, model, base)
+    return Result(workspace, state, learner, base)
 
 
 def in_a_line(row: dict[str, Any]) -> str:

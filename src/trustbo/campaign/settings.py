@@ -6,13 +6,11 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from trustbo.errors import TrustboError, require_kind, require_whole
+from trustbo.errors import require_kind, require_whole
 from trustbo.files import to_json, to_plain
 from trustbo.hazard import Hazard
 from trustbo.inference.fit import fit
-from trustbo.models import HumanTrust, default_model
-from trustbo.models.model import TrustModel
-from trustbo.models.record import model_to_record
+from trustbo.inference.learner import Learner
 from trustbo.planning import Planner
 from trustbo.planning.policies import Policy
 from trustbo.workspace import Workspace
@@ -35,23 +33,9 @@ def require_options_of_fit(options: Mapping[str, Any]) -> None:
     _FIT.bind([], **own, progress=True, latent=False, **options)
 
 
-def require_model(model: Any) -> TrustModel:
-    """Return the model of a campaign, by default the default one.
-
-    Raises:
-        TrustboError: It is not a trust model, or a model without paths.
-    """
-    if model is None:
-        return default_model()
-    require_kind("model", model, TrustModel, "give a trust model, such as PooledTrust()")
-    if isinstance(model, HumanTrust):
-        raise TrustboError("model: HumanTrust cannot plan paths; give PooledTrust() instead.")
-    return model
-
-
 def to_settings(
     base: Planner,
-    model: TrustModel,
+    learner: Learner,
     policy: str | Policy,
     *,
     objective: str,
@@ -66,7 +50,7 @@ def to_settings(
 
     Args:
         base: Planner before any learning.
-        model: Trust model.
+        learner: Learner of the model.
         policy: Argument of `Campaign`, like all others.
         objective: Objective of the paths.
         sampler: Sampler of the posterior.
@@ -95,9 +79,9 @@ def to_settings(
         "planner": to_plain("planner", planner),
         "fit": to_plain("fit", fit),
         "hazard": asdict(hazard),
-        "family": model.family,
-        "model": model.in_short(),
-        "model_record": model_to_record(model),
+        "family": learner.family,
+        "model": learner.in_short(),
+        "model_record": learner.record(),
     }
     return json.loads(to_json(settings))
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from trustbo.errors import require_share
-from trustbo.inference import params_of
 from trustbo.planning import InfeasibleError
 from trustbo.workspace.moves import bounds_along
 
@@ -73,7 +72,7 @@ class RegretBound:
             return 0.0
 
         planner = campaign.planner
-        draws = params_of(posterior())
+        draws = campaign.learner.draws(posterior(), campaign.workspace)
         try:
             path = planner.plan(draws.mean()).path
             drawn = planner.plan_draws(draws, n_draws=_N_DRAWS)

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission, is_line_of_sight
-from trustbo.errors import Renamed, TrustboError, require_count, require_kind, require_whole
+from trustbo.errors import TrustboError, require_count, require_kind, require_whole
 from trustbo.inference.density import Density, Draws
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.inference.variables import draws_of, prior_parameters
@@ -19,7 +19,6 @@ from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
 from trustbo.models.params import Params, assemble_params
 from trustbo.models.record import effects_from_record, model_from_record, with_default_priors
-from trustbo.parallel import computing
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
@@ -29,7 +28,7 @@ _NEXT_MISSION_SEED = 20261123
 """Seed of the next mission's robot effects, so that bands are reproducible."""
 _N_MEAN = 4096
 """Number of draws averaged to compute a prior mean."""
-_ATTRIBUTES = ("family", "x0_mean", "x0_sd", "model_record")
+_ATTRIBUTES = ("family", "model_record")
 """Attributes that a posterior must have."""
 
 
@@ -105,34 +104,14 @@ def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarra
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also for 0 draws
 
 
-@Renamed(day="next_mission")
-@computing()
-def params_of(
+def params_of_model(
     posterior: xr.DataTree, workspace: Workspace | None = None, *, next_mission: bool = False
 ) -> Params:
-    """Return all draws of a posterior as parameters, with chains joined in a leading axis (draw,).
-
-    Args:
-        posterior: DataTree from `fit`.
-        workspace: Workspace for planning; features and robots are reordered to match the workspace.
-        next_mission: Whether to draw the robot effects of the next mission, including their
-            mission-specific part, for credible bands and predicted rates. By default, expected
-            effects are used, as planning needs.
-
-    Returns:
-        `TrustParams`, `RobotParams` or `CoupledParams`, depending on the model. A pooled model with
-        robot effects gives `RobotParams` for the next mission, in which the line-of-sight weights
-        include each robot's persistent effect, decayed by one mission.
-
-    Raises:
-        TrustboError: If the posterior is not from `fit`; a variable is missing or has NaN draws; or
-            features or robots differ from those of the workspace.
-    """
+    """Return all draws of a posterior of a model class; see `learner.params_of`."""
     return _read_params(posterior, workspace, [next_mission])[0]
 
 
-@computing()
-def expected_and_drawn(
+def expected_and_drawn_of_model(
     posterior: xr.DataTree, workspace: Workspace | None = None
 ) -> tuple[Params, Params]:
     """Return `params_of` without and with `next_mission`; the posterior is read once."""
@@ -144,7 +123,7 @@ def _read_params(
     posterior: xr.DataTree, workspace: Workspace | None, next_mission: Sequence[bool]
 ) -> list[Params]:
     """Return the parameters for each value of `next_mission`; see `params_of`."""
-    if is_of_people(require_posterior("params_of", posterior)):
+    if is_of_people(posterior):
         raise TrustboError(
             "a posterior of HumanTrust cannot be used for planning; to predict reports, use "
             "trustbo.inference.predict_reports."

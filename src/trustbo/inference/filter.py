@@ -10,11 +10,13 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import Names, read_labelled
 from trustbo.data import Cell, require_shares, require_unit_interval
 from trustbo.errors import Renamed, TrustboError, one_line, require_pair, require_whole
-from trustbo.inference.draws import names_in, params_of, require_posterior
+from trustbo.inference.draws import names_in, require_posterior
 from trustbo.inference.importance import systematic
+from trustbo.inference.learner import params_of
+from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import NO_TICKS
-from trustbo.models.params import Params, check_params
+from trustbo.models.params import ParameterDraws, check_params
 from trustbo.parallel import computing
 from trustbo.statespace import Inputs, kalman
 from trustbo.workspace import Workspace
@@ -24,8 +26,6 @@ _TICKS = 200.0
 """Number of ticks assumed for a future bound."""
 _BAND = (0.05, 0.95)
 """Quantiles of predicted contact rates."""
-Effect = np.ndarray | float
-"""Place effect of a bound, an array (draw, robot or 1) or a number."""
 
 
 class TrustState(NamedTuple):
@@ -78,7 +78,7 @@ class TrustFilter:
     @computing()
     def __init__(
         self,
-        posterior: xr.DataTree | Params,
+        posterior: xr.DataTree | Draws,
         n_robots: int | None = None,
         *,
         family: str = "gaussian",
@@ -114,7 +114,7 @@ class TrustFilter:
             if workspace is None:
                 self._names = {axis: names_in(posterior, axis) or None for axis in self._names}
             posterior = params_of(posterior, workspace, next_mission=True)
-        elif not isinstance(posterior, Params):
+        elif not isinstance(posterior, Draws):
             raise TrustboError(
                 "TrustFilter needs a posterior from fit or parameter draws; got "
                 f"{one_line(posterior)}. A campaign has no posterior before the first mission; "
@@ -127,20 +127,21 @@ class TrustFilter:
             raise TrustboError("TrustParams do not contain the number of robots; give n_robots.")
         self._n_robots = require_whole("n_robots", n_robots, 1)
         self._n_features = posterior.n_features
-        check_params(posterior, self._n_robots, self._n_features)
+        if isinstance(posterior, ParameterDraws):
+            check_params(posterior, self._n_robots, posterior.n_features)  # pyright: ignore[reportArgumentType]
 
         flat = posterior.flat()
-        n_draws = len(flat.b)
+        [n_draws] = flat.leading
         max_draws = require_whole("max_draws", max_draws, 1)
         kept = np.linspace(0, n_draws - 1, min(n_draws, max_draws)).astype(int)
-        self.params: Params = flat.draw(kept)
+        self.params: Draws = flat.draw(kept)
         self.likelihood = FAMILIES[family]
         self.space = self.params.state_space(self._n_robots, adds_noise=self.likelihood.adds_noise)
         self.reset()
 
     def reset(self) -> None:
         """Start a new mission with equally weighted draws."""
-        n = len(self.params.b)
+        [n] = self.params.leading
         self._belief = self.start()
         self._log_weight = np.zeros(n)
         self.weights = np.full(n, 1.0 / n)
@@ -148,7 +149,7 @@ class TrustFilter:
 
     def start(self) -> kalman.Belief:
         """Return trust before the first bound under each draw."""
-        offset = np.broadcast_to(self.params.initial_offset, len(self.params.b))
+        offset = np.broadcast_to(self.params.initial_offset, self.params.leading)
         n_groups = self._n_robots // self.space.n_members
         return kalman.initial(self.space, n_groups, offset[:, None, None])
 
@@ -242,26 +243,24 @@ class TrustFilter:
         return TrustForecast(mean, sd, draws.mean(0), low, high, draws)
 
     def inputs(self, awareness: np.ndarray, path: Sequence[Cell] | None) -> list[Inputs]:
-        """Return the inputs of each bound, with the place effects of a path if there are any.
+        """Return the inputs (draw, group, member) of each bound of a path.
 
         `awareness` has shape (bound, robot, feature).
         """
-        effects = self._effects(path, len(awareness))
-        return [
-            self._grouped_inputs(self.params.of_bound(z) + effect)
-            for z, effect in zip(awareness, effects, strict=True)
-        ]
+        bounds = self._bounds(path, len(awareness))
+        u = self.params.inputs(np.swapaxes(awareness, 0, 1), bounds)
+        u = np.broadcast_to(u, (len(u), self._n_robots, len(awareness)))
+        return [self.params.as_inputs(self.space.grouped(u[..., k])) for k in range(len(awareness))]
 
-    def _grouped_inputs(self, u: np.ndarray) -> Inputs:
-        """Return inputs u (draw, robot) with the axes (draw, group, member)."""
-        u = np.broadcast_to(u, (len(u), self._n_robots))
-        return self.params.inputs(self.space.grouped(u))
+    def _bounds(self, path: Sequence[Cell] | None, n_bounds: int) -> np.ndarray:
+        """Return moves, rows and columns (bound, 3) of a path; moves are -1 if they do not matter.
 
-    def _effects(self, path: Sequence[Cell] | None, n_bounds: int) -> Sequence[Effect]:
-        """Check the cells of a path, and return the place effect of each bound, by default 0."""
-        places = self.params.places
-        if path is None and not places:
-            return [0.0] * n_bounds
+        Raises:
+            TrustboError: If the path is missing, has the wrong length, jumps or leaves the grid.
+        """
+        grid = self.params.grid_shape
+        if path is None and grid is None:
+            return np.full((n_bounds, 3), -1)
 
         given = path if isinstance(path, Iterable) else []
         cells = [require_pair("a cell", cell) for cell in given]
@@ -270,13 +269,9 @@ class TrustFilter:
                 f"bound or path must have {n_bounds + 1} cells, beginning with the current cell of "
                 f"the team; got {path!r}."
             )
-        for grid in {np.shape(value)[-2:] for value in places.values()}:
+        if grid is not None:
             require_on_grid(cells, grid)
-        bounds = bounds_along(cells)  # refuses a path that jumps
-
-        if not places:
-            return [0.0] * n_bounds
-        return list(np.moveaxis(self.params.of_places(bounds), -2, 0))
+        return bounds_along(cells)  # refuses a path that jumps
 
     def _of_robots(self, what: str, values: ArrayLike) -> np.ndarray:
         """Read values (robot,) by the names of the robots, if they are labelled."""
@@ -286,12 +281,13 @@ class TrustFilter:
         """Return awareness as an array; raises TrustboError if its shape or values are wrong."""
         dims = ("bound", "robot", "feature")[-n_axes:]
         z = read_labelled("awareness", awareness, dims, self._names).values
-        expected = (self._n_robots, self._n_features)
+        n_features = z.shape[-1] if self._n_features is None else self._n_features
+        expected = (self._n_robots, n_features)
         if z.ndim != n_axes or z.shape[-2:] != expected or not len(z):
             first = "bound, " if n_axes == 3 else ""
             raise TrustboError(
                 f"the shape of awareness must be ({first}{self._n_robots} robots, "
-                f"{self._n_features} features); got shape {z.shape}."
+                f"{n_features} features); got shape {z.shape}."
             )
 
         if np.isnan(z).any():

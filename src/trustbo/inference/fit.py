@@ -2,7 +2,8 @@
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -60,9 +61,9 @@ _MANY_SCORES = 12
 @computing()
 def fit(
     missions: Sequence[Mission],
-    model: TrustModel | None = None,
+    model: TrustModel | Callable[..., Any] | None = None,
     *,
-    sampler: str = "importance",
+    sampler: str | None = None,
     workspace: Workspace | None = None,
     draws: int = 1000,
     chains: int = 4,
@@ -77,12 +78,15 @@ def fit(
 
     Args:
         missions: Missions of one team; NaN marks contact rates that were not measured.
-        model: Trust model; by default `models.default_model()` with place and robot effects. Place
-            effects are omitted if a mission has no map or a path jumps. For reports of people (see
-            `logs.read_reports`), the default is `HumanTrust` with the scale of the reports.
+        model: Trust model, or a NumPyro function `model(awareness, contact_rate=None)` (see the
+            how-to "Your own model"). By default `models.default_model()` with place and robot
+            effects; place effects are omitted if a mission has no map or a path jumps. For reports
+            of people (see `logs.read_reports`), the default is `HumanTrust` with the scale of the
+            reports.
         sampler: `"importance"` takes independent draws by adaptive importance sampling without
             compilation, and integrates out all variables except hyperparameters. `"nuts"` uses
-            NumPyro's NUTS, which also samples trust unless rates are Gaussian.
+            NumPyro's NUTS, which also samples trust unless rates are Gaussian. By default
+            `"importance"`, and `"nuts"` for functions, for which there is no other sampler.
         workspace: Workspace of the missions. If given, features and robots are reordered to match
             the workspace, missing awareness such as line of sight is filled in (see
             `Workspace.fill`), and place effects cover the whole grid. Missions over cells without
@@ -133,20 +137,67 @@ def fit(
     if model is None:
         scale = missions[0].scale  # empty unless the missions are people's reports
         model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))
-    require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
-    require_choice("sampler", sampler, SAMPLERS)
     draws = require_count("draws", draws)
     chains = require_count("chains", chains)
     if warmup is not None:
         warmup = require_count("warmup", warmup)
     seed = require_whole("seed", seed, 0)
-
-    model = model.for_features(missions[0].features)
-    observations = model.observations(missions, workspace)
-    if np.isnan(observations.contact_rate).all():
+    if all(np.isnan(mission.contact_rate).all() for mission in missions):
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
 
-    density = Density(model, observations)
+    add_latent: Callable[[xr.DataTree], xr.DataTree]
+    if isinstance(model, TrustModel | type) or not callable(model):
+        remedy = "give a model such as PooledTrust(), or a NumPyro function"
+        trust_model: TrustModel = require_kind("model", model, TrustModel, remedy)
+        sampler = SAMPLERS[0] if sampler is None else require_choice("sampler", sampler, SAMPLERS)
+        tree, complaints, add_latent = _fit_model(
+            missions, trust_model, sampler, workspace, draws, chains, warmup, seed, progress, start
+        )
+    else:
+        from trustbo.inference.functions import fit as of_function  # slow to import
+
+        function = of_function.as_model(model)
+        if sampler not in (None, "nuts"):
+            raise TrustboError(f"a NumPyro function is sampled by 'nuts'; got {sampler!r}.")
+        tree, complaints = of_function.fit_function(
+            missions, function, workspace, draws, chains, warmup, seed, progress, start
+        )
+        add_latent = partial(
+            of_function.with_latent_of_function,
+            missions=missions,
+            model=function,
+            progress=progress,
+        )
+
+    if check and complaints:
+        raise PosteriorError(
+            f"the sampler's diagnostics are bad: {'; '.join(complaints)}.",
+            tree,
+            "Give more missions, use narrower priors or, for NUTS, increase draws and warmup. To "
+            "get the posterior anyway, pass check=False.",
+        )
+
+    if latent:
+        tree = add_latent(tree)
+    tree.attrs["seconds"] = time.perf_counter() - started
+    return tree
+
+
+def _fit_model(
+    missions: Sequence[Mission],
+    model: TrustModel,
+    sampler: str,
+    workspace: Workspace | None,
+    draws: int,
+    chains: int,
+    warmup: int | None,
+    seed: int,
+    progress: bool,
+    start: xr.DataTree | None,
+) -> tuple[xr.DataTree, list[str], Callable[[xr.DataTree], xr.DataTree]]:
+    """Fit a model class; return the posterior, failed checks, and a function as `add_latent`."""
+    model = model.for_features(missions[0].features)
+    density = Density(model, model.observations(missions, workspace))
     if sampler == "importance":
         draws = chains * draws
         chains = 1  # independent draws belong to one chain
@@ -172,19 +223,11 @@ def fit(
         tree["sample_stats"].attrs["proposal"] = summary.pop("proposal")
     tree.attrs |= _record(model, density) | summary | {"sampler": sampler, "seed": seed}
 
-    if check and complaints:
-        raise PosteriorError(
-            f"the sampler's diagnostics are bad: {'; '.join(complaints)}.",
-            tree,
-            "Give more missions, use narrower priors or, for NUTS, increase draws and warmup. To "
-            "get the posterior anyway, pass check=False.",
-        )
-
-    if latent:
+    def add_latent(posterior: xr.DataTree) -> xr.DataTree:
         as_read = draws_of(density, variables)  # equal to what `add_latent` reads from a file
-        tree = with_latent(tree, missions, density, as_read, progress=progress)
-    tree.attrs["seconds"] = time.perf_counter() - started
-    return tree
+        return with_latent(posterior, missions, density, as_read, progress=progress)
+
+    return tree, complaints, add_latent
 
 
 def by_importance(

@@ -128,7 +128,7 @@ def _predict(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return log densities (bound, robot) and draws (draw, bound, robot) of the rates."""
     z = mission.awareness
-    path = mission.path[: len(z) + 1] if trust.params.places and mission.path else None
+    path = mission.path[: len(z) + 1] if trust.params.grid_shape and mission.path else None
 
     counts = trust.space.grouped(ticks)
     ahead = kalman.forecast(

@@ -11,18 +11,13 @@ from trustbo.display import slow_bar
 from trustbo.inference.density import Density, Draws
 from trustbo.inference.draws import (
     effects_of,
-    missions_of,
     parameters_of,
-    read_posterior,
-    require_posterior,
 )
 from trustbo.inference.latent import latent_of, replicate
 from trustbo.inference.variables import draw_prior
 from trustbo.models.effects.effect import Effect
-from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
 from trustbo.models.scores import log_density
-from trustbo.parallel import computing
 from trustbo.streams import stream
 
 _OF_RATES = ("mission", "bound", "robot")
@@ -40,6 +35,7 @@ def to_datatree(
     missions: Sequence[Mission],
     parameter_dims: dict[str, tuple[str, ...]],
     effects: Sequence[Effect] = (),
+    labels: Mapping[str, Any] | None = None,
 ) -> xr.DataTree:
     """Build a DataTree with named axes, without padding, and with NaN after a mission's end.
 
@@ -48,19 +44,21 @@ def to_datatree(
         missions: Missions of the posterior.
         parameter_dims: Axes of the model's parameters by name, without (chain, draw).
         effects: Effects of the model; the groups may include variables of these effects.
+        labels: Labels of further axes.
     """
     observed = Observations.from_missions(missions)
     n_missions, n_bounds = observed.contact_rate.shape[:2]
     lengths = np.array([len(m.bounds) for m in missions])
     ended = (np.arange(1, n_bounds + 1) > lengths[:, None])[..., None]  # (mission, bound, robot)
 
-    coords = {
+    coords: dict[str, Any] = {
         "mission": np.arange(n_missions),
         "bound": np.arange(1, n_bounds + 1),
         "robot": list(missions[0].robots),
         "robot_": list(missions[0].robots),
         "feature": list(missions[0].features),
     }
+    coords = {**(labels or {}), **coords}
     dims_of = _DIMS | parameter_dims
     for effect in effects:
         dims_of |= effect.variables
@@ -142,40 +140,6 @@ def parameters_alone(posterior: xr.DataTree) -> xr.DataTree:
     return alone
 
 
-@computing()
-def add_latent(
-    posterior: xr.DataTree,
-    missions: Sequence[Mission] | None = None,
-    *,
-    model: TrustModel | None = None,
-    progress: bool = True,
-) -> xr.DataTree:
-    """Add latent trust, log-likelihoods and predictions to a posterior.
-
-    A campaign stores only the parameters of its posteriors because the other groups grow with the
-    number of missions. The other groups can be computed at any time with the same result.
-
-    Args:
-        posterior: DataTree from `fit`, or one of `Result.posteriors`.
-        missions: Fitted missions; needed if the posterior contains no data.
-        model: Model of the posterior; needed if the priors are custom.
-        progress: Whether to show a progress bar after 5 seconds.
-
-    Returns:
-        The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive`,
-        `log_prior` and `log_likelihood`, or the unchanged posterior if `latent` already exists.
-
-    Raises:
-        TrustboError: If the posterior contains no data and no missions are given.
-    """
-    if "latent" in require_posterior("add_latent", posterior).children:
-        return posterior
-
-    missions = missions_of(posterior) if missions is None else missions
-    fitted, draws = read_posterior(posterior, missions, model=model)
-    return with_latent(posterior, missions, fitted, draws, progress=progress)
-
-
 def with_latent(
     posterior: xr.DataTree,
     missions: Sequence[Mission],
@@ -197,12 +161,8 @@ def with_latent(
     fitted.run_ep(draws.theta)
     seed = posterior.attrs["seed"]
 
-    sizes = posterior["posterior"].sizes
-    n_chains = sizes["chain"]
-    n_draws = sizes["draw"]
-    n_kept = min(n_draws, max(1, _N_TRAJECTORIES // n_chains))
-    kept = np.linspace(0, n_draws - 1, n_kept).astype(int)
-    some = (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
+    n_chains = posterior["posterior"].sizes["chain"]
+    kept, some = kept_draws(posterior)
     with slow_bar("latent trust", " draws", progress) as bar:
         fitted.evaluated = bar.update
         latent = latent_of(fitted, draws, some, stream(seed, "latent"))
@@ -244,6 +204,16 @@ def with_latent(
     whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
     whole.attrs = posterior.attrs | {"log_likelihood_of": likelihood_of}
     return whole
+
+
+def kept_draws(posterior: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:
+    """Return which draws of each chain have latent trust, and their indices with chains joined."""
+    sizes = posterior["posterior"].sizes
+    n_chains = sizes["chain"]
+    n_draws = sizes["draw"]
+    n_kept = min(n_draws, max(1, _N_TRAJECTORIES // n_chains))
+    kept = np.linspace(0, n_draws - 1, n_kept).astype(int)
+    return kept, (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
 
 
 def log_prior(fitted: Density, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

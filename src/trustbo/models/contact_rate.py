@@ -4,6 +4,7 @@ from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro.distributions as dist
 from jax import Array, lax, random
 from jax.typing import ArrayLike
@@ -11,105 +12,145 @@ from numpyro.distributions import constraints
 
 from trustbo.errors import OldName, TrustboError
 from trustbo.statespace import Inputs, StateSpace, kalman
-from trustbo.statespace.form import independent_robots
+from trustbo.statespace.form import coupled_robots, independent_robots
 from trustbo.statespace.matrices import apply, root
 
 
 class ContactRate(dist.Distribution):
-    """Distribution of contact rates given the drift, equations (3)-(4), with trust integrated out.
+    """Distribution of contact rates given the drift, with trust integrated out.
 
-    x_k = beta0 x_{k-1} + drift_k + delta_w w_k, y_k = x_k + delta_v v_k, x_0 ~ N(x0_mean, x0_sd^2)
+        d_k = beta0 d_{k-1} + drift_k + delta_w w_k,    d_0 ~ N(x0_mean, x0_sd^2)
+        x_k = d_k + offset_k,    y_k = x_k + delta_v v_k + delta_s s_k
 
-    The batch shape is (mission,) and the event shape is (bound, robot). NaN marks unmeasured rates.
-    `drift` may be any function of awareness and other sampled parameters:
+    These are equations (3)-(4) of the paper. If beta0, delta_w or delta_v is a matrix, they are
+    (1)-(2). The batch shape is (mission,) and the event shape is (bound, robot). NaN marks rates
+    that were not measured. `drift` may be any function of awareness and other sampled parameters:
 
     >>> drift = level + most * (1.0 - jnp.exp(-rise * awareness[..., 1]))
     >>> with numpyro.plate("mission", len(drift)):
     ...     rates = ContactRate(drift, beta0, delta_w, delta_v)
     ...     numpyro.sample("contact_rate", rates, obs=contact_rate)
-
-    For robots that influence each other or share noise, see `ContactRate.from_space`.
     """
 
     support = constraints.independent(constraints.real, 2)  # pyright: ignore
-    pytree_data_fields = ("inputs", "space")
+    pytree_data_fields = ("inputs", "n_ticks", "space")
 
     @jax.numpy_rank_promotion("allow")
     def __init__(
         self,
-        drift: Array,
+        drift: ArrayLike,
         beta0: ArrayLike,
         delta_w: ArrayLike,
         delta_v: ArrayLike,
         x0_mean: ArrayLike = 0.5,
         x0_sd: ArrayLike = 0.5,
+        *,
+        offset: ArrayLike = 0.0,
+        delta_s: ArrayLike | None = None,
+        n_ticks: ArrayLike | None = None,
     ) -> None:
-        """Set the drift and the parameters.
+        """Set the inputs of bounds and the parameters.
 
         Args:
             drift: Drift of trust in each bound, shape (mission, bound, robot).
-            beta0: Autoregression coefficient, shape () or (robot,).
-            delta_w: Standard deviation of the process noise, shape () or (robot,).
-            delta_v: Standard deviation of the observation noise, shape () or (robot,).
-            x0_mean: Mean of trust before the first bound, shape ().
-            x0_sd: Standard deviation of trust before the first bound, shape ().
+            beta0: Autoregression coefficient, shape () or (robot,), or the matrix B0 (robot,
+                robot), whose entry (i, j) is the influence of robot j on robot i.
+            delta_w: Standard deviation of the process noise, shape () or (robot,), or the
+                covariance matrix (robot, robot).
+            delta_v: Standard deviation of the observation noise, shape () or (robot,), or the
+                covariance matrix (robot, robot).
+            x0_mean: Mean of trust before the first bound, shape () or (robot,).
+            x0_sd: Standard deviation of trust before the first bound, shape () or (robot,).
+            offset: Input that affects the trust of one bound only, shape () or that of `drift`. A
+                model with an offset cannot plan. With memory of deviations, give all inputs as
+                `offset`, a drift of zeros and x0_mean = 0.
+            delta_s: Standard deviation of the noise s that all robots share, shape (), or None.
+            n_ticks: Number of ticks of each rate, in the shape of `drift`. If every measured rate
+                has one, `log_prob` is of the counts of ticks, as the log-likelihoods of `fit` are;
+                otherwise, it is the density of the rates.
 
         Raises:
             TrustboError: The drift or a parameter has another shape.
         """
-        values = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v}
-        values = {name: jnp.asarray(value) for name, value in values.items()}
-        drift = jnp.asarray(drift)
-        if drift.ndim != 3:
+        u = jnp.asarray(drift, float)
+        if u.ndim != 3:
             raise TrustboError(
-                f"drift must have the shape (mission, bound, robot); got {drift.shape}. For one "
+                f"drift must have the shape (mission, bound, robot); got {u.shape}. For one "
                 "mission, give drift[None]."
             )
 
-        n_robots = drift.shape[2]
-        for name, value in values.items():
-            if value.ndim and value.shape[-1] not in (1, n_robots):
+        n_robots = u.shape[2]
+        for name, value in {"offset": offset, "n_ticks": n_ticks}.items():
+            if value is not None and np.shape(value) not in ((), u.shape):
                 raise TrustboError(
-                    f"{name} must have the shape () or ({n_robots},), as drift is of the shape "
-                    f"(mission, bound, robot) = {drift.shape}; got {value.shape}."
+                    f"{name} must have the shape (mission, bound, robot) = {u.shape} of the drift; "
+                    f"got {np.shape(value)}."
                 )
 
-        space = independent_robots(
-            values["beta0"].reshape(1, -1),
-            values["delta_w"].reshape(1, -1),
-            values["delta_v"].reshape(1, -1),
-            jnp.asarray(x0_mean),
-            jnp.asarray(x0_sd),
-        )
-        self._set(space, Inputs(drift))
+        matrices = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v}
+        values = {name: _checked(name, v, n_robots, True) for name, v in matrices.items()}
+        x0 = {"x0_mean": x0_mean, "x0_sd": x0_sd}
+        x0 = {name: _checked(name, v, n_robots, False)[None] for name, v in x0.items()}
+
+        if any(value.ndim == 2 for value in values.values()):
+            space = _coupled(values, x0, delta_s, n_robots)
+        else:
+            shared = None if delta_s is None else jnp.reshape(jnp.asarray(delta_s, float), (1,))
+            space = independent_robots(
+                *(value.reshape(1, -1) for value in values.values()),
+                **x0,
+                delta_s=shared,
+                n_members=1 if shared is None else n_robots,
+            )
+        self._set(space, Inputs(u, offset), n_ticks)
 
     of = OldName("from_space")
 
     @classmethod
-    def from_space(cls, space: StateSpace, inputs: Inputs) -> Self:
+    def from_space(
+        cls, space: StateSpace, inputs: Inputs, n_ticks: ArrayLike | None = None
+    ) -> Self:
         """Return the distribution for any state-space form.
 
         Args:
             space: Parameters at one point.
             inputs: Drift and offset, each with shape (mission, bound, robot) or ().
+            n_ticks: Number of ticks of each rate; see `ContactRate`.
         """
         self = cls.__new__(cls)
-        self._set(space, inputs)
+        self._set(space, inputs, n_ticks)
         return self
 
-    def _set(self, space: StateSpace, inputs: Inputs) -> None:
+    def _set(self, space: StateSpace, inputs: Inputs, n_ticks: ArrayLike | None) -> None:
         """Set the parameters, and the inputs (mission, bound, group, member)."""
         drift, offset = jnp.broadcast_arrays(*(jnp.asarray(value, float) for value in inputs))
         shape = drift.shape
         grouped = *shape[:2], shape[2] // space.n_members, space.n_members
 
         self.inputs = Inputs(drift.reshape(grouped), offset.reshape(grouped))
+        self.n_ticks = None if n_ticks is None else jnp.broadcast_to(jnp.asarray(n_ticks), shape)
         self.space = space
         dist.Distribution.__init__(self, shape[:1], shape[1:])
+
+    def log_resolution(self, value: Array) -> Array:
+        """Compute the log ratio (mission,) of the probability of tick counts to a density.
+
+        One tick has the width 1 / n_ticks. The ratio is 0 if a measured rate has no tick count.
+        """
+        if self.n_ticks is None:
+            return jnp.zeros(self.batch_shape)
+
+        is_measured = ~jnp.isnan(value)
+        is_counted = self.n_ticks > 0.0
+        every = (is_counted | ~is_measured).all()
+        ratio = jnp.where(is_measured & is_counted, -jnp.log(self.n_ticks), 0.0).sum((1, 2))
+        return jnp.where(every, ratio, 0.0)
 
     @jax.numpy_rank_promotion("allow")
     def log_prob(self, value: Array) -> Array:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Compute the log density (mission,) of each mission with the Kalman filter.
+
+        With `n_ticks`, it is the log probability of the tick counts.
 
         Raises TrustboError unless `value` has the shape (mission, bound, robot) of the drift.
         """
@@ -134,7 +175,7 @@ class ContactRate(dist.Distribution):
             lambda a: jnp.broadcast_to(a.astype(float), (n_missions, *a.shape[1:])),
             kalman.initial(self.space, n_groups),
         )
-        return lax.scan(step, start, by_bound)[1].sum(0)
+        return lax.scan(step, start, by_bound)[1].sum(0) + self.log_resolution(value)
 
     @jax.numpy_rank_promotion("allow")
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -146,16 +187,61 @@ class ContactRate(dist.Distribution):
         shape = *sample_shape, *drift.shape
         w, v, s, e = (random.normal(k, shape) for k in random.split(key, 4))
 
-        d = space.initial_mean + apply(root(space.initial_cov), e[..., 0, :, :])
-        rates = []
-        for k in range(drift.shape[1]):  # equations (1) and (2)
-            noise = apply(root(space.process_cov), w[..., k, :, :])
-            d = kalman.step(space.transition, d, drift[:, k]) + noise
-
-            f = d + offset[:, k]
+        def step(d: Array, bound: Any) -> tuple[Array, Array]:  # equations (1) and (2)
+            u, o, process, shared, own = bound
+            d = kalman.step(space.transition, d, u) + apply(root(space.process_cov), process)
+            f = d + o
             if space.shared_cov is not None:
-                f = f + apply(root(space.shared_cov), s[..., k, :, :])
-            rates.append(f + space.noise_sd * v[..., k, :, :])
+                f = f + apply(root(space.shared_cov), shared)
+            return d, f + space.noise_sd * own
 
-        drawn = jnp.stack(rates, axis=-3)
+        def by_bound(values: Array) -> Array:
+            return jnp.moveaxis(values, -3, 0)
+
+        d = space.initial_mean + apply(root(space.initial_cov), e[..., 0, :, :])
+        bounds = tuple(by_bound(values) for values in (drift, offset, w, s, v))
+        _, rates = lax.scan(step, jnp.broadcast_to(d, e[..., 0, :, :].shape), bounds)
+
+        drawn = jnp.moveaxis(rates, 0, -3)
         return drawn.reshape(*sample_shape, *self.batch_shape, *self.event_shape)
+
+
+def _checked(name: str, value: ArrayLike, n_robots: int, may_be_matrix: bool) -> Array:
+    """Return a parameter as an array of floats; raises TrustboError if its shape is wrong."""
+    array = jnp.asarray(value, float)
+    allowed: list[tuple[int, ...]] = [(), (1,), (n_robots,)]
+    if may_be_matrix:
+        allowed.append((n_robots, n_robots))
+    if array.shape not in allowed:
+        shapes = f"() or ({n_robots},)"
+        if may_be_matrix:
+            shapes = f"(), ({n_robots},) or ({n_robots}, {n_robots})"
+        raise TrustboError(
+            f"{name} must have the shape {shapes}, as the drift has {n_robots} robots; got "
+            f"{array.shape}."
+        )
+    return array
+
+
+def _coupled(
+    values: dict[str, Array], x0: dict[str, Array], delta_s: ArrayLike | None, n_robots: int
+) -> StateSpace:
+    """Return the form of robots that influence each other or have correlated noise."""
+    identity = jnp.eye(n_robots)
+
+    def matrix(name: str, *, squared: bool) -> Array:
+        value = values[name]
+        if value.ndim == 2:
+            return value
+        return identity * (value**2 if squared else value)
+
+    noise = matrix("delta_v", squared=True)
+    if delta_s is not None:
+        noise = noise + jnp.asarray(delta_s, float) ** 2
+    return coupled_robots(
+        matrix("beta0", squared=False)[None],
+        matrix("delta_w", squared=True)[None],
+        noise[None],
+        x0["x0_mean"],
+        x0["x0_sd"],
+    )

@@ -257,7 +257,8 @@ class TrustModel(Summary, ABC):
                 drift=((dense * carried) @ c).reshape(observations.contact_rate.shape),
                 offset=((dense * ~carried) @ c).reshape(observations.contact_rate.shape),
             )
-            rates = ContactRate.from_space(self.state_space(theta, observations.n_robots), inputs)
+            space = self.state_space(theta, observations.n_robots)
+            rates = ContactRate.from_space(space, inputs, observations.n_ticks)
             with numpyro.plate("mission", observations.n_missions):
                 numpyro.sample("contact_rate", rates, obs=observations.contact_rate)
             return

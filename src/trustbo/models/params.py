@@ -6,12 +6,11 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 
 from trustbo.arrays import require_numbers
-from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
-from trustbo.statespace import Inputs, StateSpace
+from trustbo.models.draws import Draws
+from trustbo.statespace import StateSpace
 from trustbo.statespace.form import coupled_robots, independent_robots
-from trustbo.workspace.moves import bounds_along
 
 Numbers = Any
 """A float, a NumPy array, or a JAX array or tracer."""
@@ -22,8 +21,8 @@ PLACES: Mapping[str, tuple[str, ...]] = {
 """Axes of the fields that contain place effects, after the leading axes."""
 
 
-class ParameterDraws(Summary):
-    """Mixin with methods common to the parameters of all models."""
+class ParameterDraws(Summary, Draws):
+    """Mixin with methods common to the parameters of all built-in models."""
 
     __slots__ = ()
 
@@ -105,30 +104,65 @@ class ParameterDraws(Summary):
         return self.memory == "level"  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
-    def initial_offset(self) -> Numbers:
-        """Offset before the first bound: trust is x0_mean, whatever is carried over."""
-        return 0.0 if self.carried else self.x0_mean  # pyright: ignore[reportAttributeAccessIssue]
+    def by_robot(self) -> bool:
+        """See `Draws.by_robot`."""
+        return self.BY_ROBOT
 
-    def inputs(self, u: np.ndarray) -> Inputs:
-        """Return inputs as a drift if they are carried over, otherwise as an offset."""
-        return Inputs(u) if self.carried else Inputs(drift=0.0, offset=u)
+    @property
+    def grid_shape(self) -> tuple[int, int] | None:
+        """Shape (row, col) of the grid of place effects; None without place effects."""
+        for effect in self.places.values():
+            return effect.shape[-2:]
+        return None
 
-    def of_bound(self, awareness: np.ndarray) -> np.ndarray:
-        """Compute the input (draw, robot) of a bound with awareness (robot, feature).
+    def inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
+        """Compute the input u = sum_m beta_m z_m + b of bounds, with any place effects.
 
-        Place effects are not included; see `of_places`.
+        See `Draws.inputs`.
+
+        Raises:
+            TrustboError: If the number of robots, features or cells does not match the parameters.
         """
-        u = self.increments(awareness[:, None, None, None])[..., 0, 0, 0]
-        b = np.asarray(self.b)  # pyright: ignore[reportAttributeAccessIssue]
-        return u + (b if self.BY_ROBOT else b[..., None])
+        n_robots = None if self.places else len(awareness)
+        check_params(self, n_robots, awareness.shape[-1])  # pyright: ignore[reportArgumentType]
+        u = self.increments(awareness)
+
+        axes = awareness.ndim - 2  # of bounds
+        b = np.asarray(self.b, dtype=float)  # pyright: ignore[reportAttributeAccessIssue]
+        if not self.BY_ROBOT:
+            b = b[..., None]
+        u += b.reshape(*b.shape, *(1,) * axes)  # in place, because the array can be large
+
+        if bounds is not None:
+            return u + self.of_places(bounds) if self.places else u
+
+        for name, effect in self.places.items():
+            if effect.shape[-2:] != u.shape[-2:]:
+                raise TrustboError(
+                    f"params.{name} has the grid shape {effect.shape[-2:]}, but the awareness has "
+                    f"{u.shape[-2:]}. Give the awareness of the same grid."
+                )
+            if name == "place":  # the effect of a cell is the same for all moves that enter it
+                effect = effect[..., None, :, :]
+            u = u + effect
+
+        return u
+
+    def team_inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
+        """See `Draws.team_inputs`; weights that robots share apply to their mean awareness."""
+        if len(awareness) > 1 and not self.BY_ROBOT:
+            awareness = awareness.mean(0, keepdims=True)
+        return super().team_inputs(awareness, bounds)
 
     def increments(self, awareness: np.ndarray) -> np.ndarray:
-        """Compute the drift (..., robot, move, row, col) without the intercept.
+        """Compute weighted awareness (..., robot, *bound), without the intercept.
 
-        `awareness` has the shape (robot, move, row, col, feature).
+        `awareness` has the shape (robot, *bound, feature), with any axes for bounds.
         """
+        flat = awareness.reshape(len(awareness), -1, awareness.shape[-1])
         weights = np.asarray(getattr(self, self.WEIGHTS), dtype=float)
-        return np.einsum(self.SUM, weights, awareness)
+        weighted = np.einsum(self.SUM, weights, flat)
+        return weighted.reshape(*weighted.shape[:-1], *awareness.shape[1:-1])
 
     @property
     def places(self) -> dict[str, np.ndarray]:
@@ -136,7 +170,7 @@ class ParameterDraws(Summary):
         return {name: np.asarray(v) for name, v in self.by_name.items() if name in PLACES}
 
     def of_places(self, bounds: np.ndarray) -> np.ndarray:
-        """Return the sum (..., bound, effect) of the effects of each bound and of the entered cell.
+        """Return the sum (..., effect, bound) of the effects of each bound and of the entered cell.
 
         `bounds` (bound, 3) contains moves, rows and columns; effects of move -1 are 0.
         """
@@ -147,22 +181,7 @@ class ParameterDraws(Summary):
         if "place_bound" in self.places:
             total = total + self.places["place_bound"][..., moves, rows, cols]
 
-        return np.swapaxes(np.where(moves < 0, 0.0, total), -1, -2)
-
-    def along(self, path: Sequence[Cell] | np.ndarray) -> Self:
-        """Return the parameters for the bounds of a path, with place effects in the intercept.
-
-        Without place effects, the parameters are returned unchanged. Otherwise, the fields of place
-        effects are None, and b has the shape (..., 1, bound, robot). The last axis of b has length
-        1 if b is common to all robots.
-        """
-        if not self.places:
-            return self
-
-        b = np.asarray(self.b)  # pyright: ignore[reportAttributeAccessIssue]
-        b = b[..., None, None, :] if self.BY_ROBOT else b[..., None, None, None]
-        b = b + self.of_places(bounds_along(path))[..., None, :, :]
-        return self._replace(b=b, place=None, place_bound=None)  # pyright: ignore[reportAttributeAccessIssue]
+        return np.where(moves < 0, 0.0, total)
 
     def draw(self, index: int | np.ndarray) -> Self:
         """Select draws by index; a single index also drops the leading axis."""
@@ -175,6 +194,10 @@ class ParameterDraws(Summary):
     def flat(self) -> Self:
         """Return every field in float64 with exactly one leading axis (draw,)."""
         return self._replace(**self._joined(list(self.by_name)))  # pyright: ignore[reportAttributeAccessIssue]
+
+    def record(self) -> dict[str, Any]:
+        """See `Draws.record`."""
+        return {name: np.asarray(value).tolist() for name, value in self.by_name.items()}
 
     def map(self, function: Callable[[Numbers, int], Numbers]) -> Self:
         """Apply `function(field, number of trailing axes)` to every field."""
@@ -240,7 +263,7 @@ class RobotParams(ParameterDraws, _Trust):
         **dict.fromkeys(("beta0", "b", "delta_w", "delta_v"), ("robot",)),
         **PLACES,
     }
-    SUM: ClassVar = "...im,...idrcm->...idrc"
+    SUM: ClassVar = "...im,...ikm->...ik"
 
 
 class _Coupled(NamedTuple):
@@ -265,7 +288,7 @@ class CoupledParams(ParameterDraws, _Coupled):
 
     __slots__ = ()
     WEIGHTS: ClassVar = "B"
-    SUM: ClassVar = "...mai,...idrcm->...adrc"
+    SUM: ClassVar = "...mai,...ikm->...ak"
     memory: ClassVar = "level"
     BY_ROBOT: ClassVar = True
     AXES: ClassVar = {

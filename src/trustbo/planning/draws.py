@@ -8,7 +8,7 @@ import numpy as np
 
 from trustbo.data import Cell
 from trustbo.errors import require_whole
-from trustbo.models.params import Params
+from trustbo.models.draws import Draws
 from trustbo.planning.objectives import capped
 from trustbo.planning.problem import EXACT, Problem
 from trustbo.planning.recursion import Recursion, states_along
@@ -99,7 +99,7 @@ class DrawnPaths:
         return paths[order], rank[which.ravel()], counts[order]
 
 
-def choose_draws(params: Params, n_draws: int | None, seed: int) -> Params:
+def choose_draws(params: Draws, n_draws: int | None, seed: int) -> Draws:
     """Choose `n_draws` draws at random, or all draws if None; the leading axis is (draw,)."""
     seed = require_whole("seed", seed, 0)
     flat = params.flat()
@@ -108,4 +108,4 @@ def choose_draws(params: Params, n_draws: int | None, seed: int) -> Params:
         return flat
 
     chosen = np.sort(np.random.default_rng(seed).choice(n, n_draws, replace=False))
-    return flat.draw(chosen)  # pyright: ignore[reportArgumentType]
+    return flat.draw(chosen)

@@ -17,8 +17,9 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import Renamed, TrustboError, require_choice, require_positive
 from trustbo.hazard.components import Components
 from trustbo.hazard.risk import Risk
+from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
-from trustbo.models.params import Params
+from trustbo.models.params import ParameterDraws
 from trustbo.parallel import computing
 from trustbo.planning.draws import DrawnPaths, choose_draws
 from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped
@@ -37,7 +38,7 @@ from trustbo.planning.recursion import Recursion, states_along, trust_recursion
 from trustbo.planning.trust_map import cost_of, trust_map
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import MOVE_NAMES, along
+from trustbo.workspace.moves import MOVE_NAMES, along, bounds_along
 
 _DIMS = ("move", "row", "col")
 _MOVE_LABELS = {"move": MOVE_NAMES}
@@ -199,7 +200,7 @@ class Planner(Summary):
         return self._with(failure_cost=cost)
 
     @computing()
-    def plan(self, params: Params | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
+    def plan(self, params: Draws | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
         """Find the best admissible path for given parameters, or for the mean of a posterior.
 
         Args:
@@ -217,11 +218,7 @@ class Planner(Summary):
         mean, draws = mean_and_draws_of(params, self.workspace)
         score, limits, paths = self.problem.best(self.problem.recursion(mean, x0))
 
-        path = self.problem.paths.cells(paths[0])
-        plan = self.evaluate(path, mean, x0=x0)
-        if draws is not None:
-            plan = plan.with_draws(self.evaluate(path, draws, x0=x0))
-
+        plan = self._evaluated(self.problem.paths.cells(paths[0]), mean, draws, x0)
         exact = bool(limits[0] - score[0] <= EXACT)
         limit = plan.value if exact else float(self.problem.objective.value(limits[0]))
         return replace(plan, exact=exact, limit=limit, seconds=time.perf_counter() - started)
@@ -241,7 +238,7 @@ class Planner(Summary):
 
     @computing()
     def plan_draws(
-        self, posterior: Params | xr.DataTree, *, n_draws: int | None = None, seed: int = 0
+        self, posterior: Draws | xr.DataTree, *, n_draws: int | None = None, seed: int = 0
     ) -> DrawnPaths:
         """Find the best path for each draw of a posterior.
 
@@ -261,7 +258,7 @@ class Planner(Summary):
 
     @computing()
     def evaluate(
-        self, path: Sequence[Cell], params: Params | xr.DataTree, *, x0: ArrayLike | None = None
+        self, path: Sequence[Cell], params: Draws | xr.DataTree, *, x0: ArrayLike | None = None
     ) -> Plan:
         """Return a plan for a given path; its `exact` is False and its `limit` is NaN.
 
@@ -277,18 +274,33 @@ class Planner(Summary):
             TrustboError: If the robots or features of the parameters differ from the workspace's,
                 or the path has gaps or does not lead from start to goal.
         """
-        problem = self.problem
         path = self.require_path(path)
-        cells = np.array(path)
-        draws = draws_of(params, self.workspace, next_mission=True)
+        return self._evaluated(path, draws_of(params, self.workspace, next_mission=True), None, x0)
 
-        trust, value, values = _value_along(problem, cells, draws, x0)
+    def _evaluated(
+        self,
+        path: tuple[Cell, ...],
+        given: Draws,
+        draws: Draws | None,
+        x0: ArrayLike | None,
+    ) -> Plan:
+        """Return a plan for a path: trust and value are those of `given`, averaged over its draws.
+
+        The bands are quantiles over `draws` or, if None, over the draws of `given`.
+        """
+        problem = self.problem
+        cells = np.array(path)
         cost = problem.failure_along(cells)
 
-        bands = np.repeat(trust, len(QUANTILES), axis=0)
+        trust, value, values = _value_along(problem, cells, given, x0)
+        drawn = trust
+        if draws is not None:
+            drawn, _, values = _value_along(problem, cells, draws, x0)
+
+        bands = np.repeat(drawn, len(QUANTILES), axis=0)
         value_band = None
-        if len(trust) > 1:
-            bands = np.quantile(trust, QUANTILES, axis=0)
+        if len(drawn) > 1:
+            bands = np.quantile(drawn, QUANTILES, axis=0)
             low, high = np.quantile(values - cost, (QUANTILES[0], QUANTILES[-1])).tolist()
             value_band = low, high
 
@@ -315,7 +327,7 @@ class Planner(Summary):
         )
 
     @computing()
-    def graph(self, params: Params | xr.DataTree) -> nx.DiGraph:
+    def graph(self, params: Draws | xr.DataTree) -> nx.DiGraph:
         """Return the cells and bounds as a networkx graph.
 
         Nodes are the passable cells `(row, col)`, with the CRS coordinates `x` and `y` of their
@@ -371,7 +383,7 @@ class Planner(Summary):
 
     @computing()
     def trust_map(
-        self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
+        self, params: Draws | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
         """Compute the largest expected trust on arrival at each cell; NaN if it is unreachable.
 
@@ -391,14 +403,14 @@ class Planner(Summary):
 
     @computing()
     def cost_map(
-        self, params: Params | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
+        self, params: Draws | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
     ) -> xr.DataArray:
         """Compute the cost f = 1 - sigma(trust) of each cell, equation (6), from `trust_map`."""
         return cost_of(self.trust_map(params, per_robot=per_robot, x0=x0))
 
     @computing()
     def maps(
-        self, posterior: Params | xr.DataTree, *, n_draws: int = 250, seed: int = 0
+        self, posterior: Draws | xr.DataTree, *, n_draws: int = 250, seed: int = 0
     ) -> xr.Dataset:
         """Compute maps of the cells under a posterior, for GIS and figures.
 
@@ -431,8 +443,9 @@ class Planner(Summary):
             "cost": (cost_of(trust).mean("draw"), "mean cost 1 - sigma(trust)"),
             "path_probability": (passable.copy(data=share), "P(cell on the best path)"),
         }
-        if "place" in params.places:
-            place = xr.DataArray(params.places["place"].mean(1), dims=("draw", "row", "col"))
+        effects = params.places if isinstance(params, ParameterDraws) else {}
+        if "place" in effects:
+            place = xr.DataArray(effects["place"].mean(1), dims=("draw", "row", "col"))
             maps["place_mean"] = place.mean("draw"), "mean place effect"
             maps["place_sd"] = place.std("draw"), "sd of the place effect"
 
@@ -472,18 +485,17 @@ def _bound_cost_of(bound_cost: ArrayLike, bounds: np.ndarray) -> np.ndarray:
 
 
 def _value_along(
-    problem: Problem, cells: np.ndarray, params: Params, x0: ArrayLike | None
+    problem: Problem, cells: np.ndarray, params: Draws, x0: ArrayLike | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Compute trust (draw, bound, robot), the value of a path, and the value for each draw.
 
     The values do not include the expected cost of failure.
     """
     x0 = problem.start(x0)
-    of_path = params.along(cells)
     z = along(problem.paths.workspace.awareness.values, cells)
-    z = z[:, None, None]  # a map with one move and one row, whose columns are the bounds
+    bounds = bounds_along(cells)
 
-    by_robot = trust_recursion(of_path, z, x0, by_robot=True)
+    by_robot = trust_recursion(params, z, x0, bounds=bounds, by_robot=True)
     trust = states_along(by_robot)
     trust = trust.reshape(-1, *trust.shape[-2:])
     values = np.atleast_1d(problem.value_along(cells, trust.mean(-1), by_robot.noise_sd))
@@ -493,6 +505,8 @@ def _value_along(
 
     # Capping the trust of each draw causes bias, so the value of each draw uses uncapped trust.
     # However, the contact lost on a path cannot be negative.
-    team = capped(problem.objective, problem.likelihood, trust_recursion(of_path, z, x0))
+    team = capped(
+        problem.objective, problem.likelihood, trust_recursion(params, z, x0, bounds=bounds)
+    )
     mean = problem.value_along(cells, states_along(team).mean(-1), team.noise_sd).mean()
     return trust, float(mean), np.minimum(values, -problem.bound_cost_along(cells))

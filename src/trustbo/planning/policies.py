@@ -10,13 +10,13 @@ from collections.abc import Callable
 import numpy as np
 
 from trustbo.errors import require_choice, require_finite, require_kind, require_share
-from trustbo.models.params import Params
+from trustbo.models.draws import Draws
 from trustbo.planning.draws import choose_draws
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.recursion import Recursion
 
-Policy = Callable[[np.random.Generator, Params, Planner], Plan]
+Policy = Callable[[np.random.Generator, Draws, Planner], Plan]
 """Function of a random generator, draws with leading axis (draw,) and a planner; returns a plan."""
 
 N_DRAWS = 200
@@ -24,13 +24,13 @@ N_DRAWS = 200
 _N_DRIFTS = 1000  # number of draws whose quantiles `optimistic` computes
 
 
-def greedy(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
+def greedy(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
     """Plan the best path under the posterior mean of the parameters, as in the paper."""
     _require(rng, params, planner)
     return planner.plan(params.mean())
 
 
-def thompson(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
+def thompson(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
     """Plan the best path under one random posterior draw (probability matching)."""
     _require(rng, params, planner)
     plan = planner.plan(params.draw(int(rng.integers(params.leading[0]))))
@@ -38,7 +38,7 @@ def thompson(rng: np.random.Generator, params: Params, planner: Planner) -> Plan
 
 
 def optimistic(
-    rng: np.random.Generator, params: Params, planner: Planner, *, quantile: float = 0.9
+    rng: np.random.Generator, params: Draws, planner: Planner, *, quantile: float = 0.9
 ) -> Plan:
     """Plan the best path for optimistic drifts.
 
@@ -58,7 +58,7 @@ def optimistic(
     return planner.evaluate(planner.best_path(optimistic), params.mean())
 
 
-def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: float = 1.0) -> Plan:
+def ucb(rng: np.random.Generator, params: Draws, planner: Planner, *, kappa: float = 1.0) -> Plan:
     """Choose, among the draws' best paths, that with the largest mean + `kappa` sd of the value."""
     _require(rng, params, planner)
     require_finite("kappa", kappa)
@@ -69,7 +69,7 @@ def ucb(rng: np.random.Generator, params: Params, planner: Planner, *, kappa: fl
     return planner.evaluate(drawn.candidates[chosen], params.mean())
 
 
-def random(rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
+def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
     """Plan the best path for random drifts, uniform on [0, 1], without using the posterior."""
     _require(rng, params, planner)
 
@@ -104,7 +104,7 @@ def resolve_policy(policy: str | Policy) -> Policy:
 def _require(rng: object, params: object, planner: object) -> None:
     """Raise TrustboError unless the arguments of a policy are of the right kinds."""
     require_kind("rng", rng, np.random.Generator, "give numpy.random.default_rng(seed)")
-    require_kind("params", params, Params, "give parameters, such as params_of(posterior)")
+    require_kind("params", params, Draws, "give parameters, such as params_of(posterior)")
     require_kind("planner", planner, Planner, "give a trustbo.planning.Planner")
 
 

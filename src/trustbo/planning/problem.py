@@ -13,9 +13,10 @@ from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.hazard.risk import ROUNDING, Risk
-from trustbo.inference.draws import expected_and_drawn, params_of
+from trustbo.inference.learner import expected_and_drawn, params_of
+from trustbo.models.draws import Draws
 from trustbo.models.families import Family
-from trustbo.models.params import Params, require_values
+from trustbo.models.params import ParameterDraws, require_values
 from trustbo.planning.labels import LOGISTIC, LOSSES, TINY_SD, Costs, best_labels
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
 from trustbo.planning.paths import AdmissiblePaths
@@ -127,7 +128,7 @@ class Problem:
         return 1.0 - self.risk.survival(path) <= self.max_failure + ROUNDING
 
     def recursion(
-        self, params: Params, x0: ArrayLike | None = None, *, by_robot: bool = False
+        self, params: Draws, x0: ArrayLike | None = None, *, by_robot: bool = False
     ) -> Recursion:
         """Build the recursion for expected trust (see `trust_recursion`)."""
         z = self.paths.workspace.awareness.values
@@ -292,8 +293,8 @@ def risk_of(p_fail: np.ndarray) -> np.ndarray:
 
 
 def draws_of(
-    posterior: Params | xr.DataTree, workspace: Workspace, *, next_mission: bool = False
-) -> Params:
+    posterior: Draws | xr.DataTree, workspace: Workspace, *, next_mission: bool = False
+) -> Draws:
     """Return the draws of a posterior or parameters, with a leading axis (draw,) if there is one.
 
     The features and robots of a posterior are reordered by name to match the workspace. See
@@ -303,21 +304,21 @@ def draws_of(
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior, workspace, next_mission=next_mission)
 
-    remedy = "give a posterior from fit, or parameters"
-    params: Params = require_kind("posterior", posterior, Params, remedy)
-    require_values(params)
-    return params.flat() if len(params.leading) > 1 else params
+    draws = require_kind("posterior", posterior, Draws, "give a posterior from fit, or parameters")
+    if isinstance(draws, ParameterDraws):
+        require_values(draws)  # pyright: ignore[reportArgumentType]
+    return draws.flat() if len(draws.leading) > 1 else draws
 
 
-def mean_of(params: Params | xr.DataTree, workspace: Workspace) -> Params:
+def mean_of(params: Draws | xr.DataTree, workspace: Workspace) -> Draws:
     """Return the mean of a posterior or of several draws; a single draw is returned unchanged."""
     draws = draws_of(params, workspace)
     return draws.mean() if draws.leading else draws
 
 
 def mean_and_draws_of(
-    params: Params | xr.DataTree, workspace: Workspace
-) -> tuple[Params, Params | None]:
+    params: Draws | xr.DataTree, workspace: Workspace
+) -> tuple[Draws, Draws | None]:
     """Return `mean_of` and the draws for bands, or None if there is only a single draw.
 
     The draws are those of `params_of(next_mission=True)`. A posterior is read once, which

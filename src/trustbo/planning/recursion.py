@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind
-from trustbo.models.params import Params, check_params, require_values
+from trustbo.models.draws import Draws
+from trustbo.models.params import ParameterDraws, require_values
 from trustbo.statespace import kalman
 from trustbo.workspace.moves import bounds_along
 
@@ -17,12 +18,12 @@ from trustbo.workspace.moves import bounds_along
 class Recursion(NamedTuple):
     """Recursion x_k = transition x_{k-1} + drift(bound) for expected trust, with x_0 = start.
 
-    The shapes are transition (..., state, state), drift (..., state, move, row, col), start
-    (..., state) and noise_sd (...,), where noise_sd is the mean over robots of the standard
-    deviation of a rate given trust, including noise that robots share. Each robot
-    is a state, and the team's trust is the mean of the states. If all robots have the same beta0,
-    the mean trust is the only state. The drift at (move, row, col) belongs to the bound that enters
-    the cell by that move; the drift is NaN if there is no such bound.
+    The shapes are transition (..., state, state), drift (..., state, move, row, col) for a map or
+    (..., state, bound) for a path, start (..., state) and noise_sd (...,), where noise_sd is the
+    mean over robots of the standard deviation of a rate given trust, including noise that robots
+    share. Each robot is a state, and the team's trust is the mean of the states. If all robots have
+    the same beta0, the mean trust is the only state. The drift at (move, row, col) belongs to the
+    bound that enters the cell by that move; the drift is NaN if there is no such bound.
     """
 
     transition: np.ndarray
@@ -35,9 +36,9 @@ class Recursion(NamedTuple):
         return self if self.start.ndim > 1 else Recursion(*(value[None] for value in self))
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "Recursion":
-        """Return the recursion with the drift of a path's bounds, (..., state, 1, 1, bound)."""
+        """Return the recursion with the drift of a path's bounds, (..., state, bound)."""
         moves, rows, cols = bounds_along(path).T
-        return self._replace(drift=self.drift[..., moves, rows, cols][..., None, None, :])
+        return self._replace(drift=self.drift[..., moves, rows, cols])
 
     def steady_state(self) -> np.ndarray:
         """Return the limit of the team's trust if a bound is repeated, (..., move, row, col)."""
@@ -46,23 +47,29 @@ class Recursion(NamedTuple):
 
 
 def trust_recursion(
-    params: Params, z: np.ndarray, x0: ArrayLike | None = None, *, by_robot: bool = False
+    draws: Draws,
+    awareness: np.ndarray,
+    x0: ArrayLike | None = None,
+    *,
+    bounds: np.ndarray | None = None,
+    by_robot: bool = False,
 ) -> Recursion:
-    """Build the recursion for expected trust from parameters with leading axes (...,).
+    """Build the recursion for expected trust from draws with leading axes (...,).
 
     Args:
-        params: Parameters of any model.
-        z: Awareness, shape (robot, move, row, col, feature).
+        draws: Draws of the parameters of any model.
+        awareness: Awareness of all bounds of a map, or of `bounds` (see `Draws.inputs`).
         x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default
-            `params.x0_mean`.
+            `draws.x0_mean`.
+        bounds: Moves, rows and columns (bound, 3) of the bounds of a path, or None for a map.
         by_robot: Whether to use one state per robot even if the team's mean would suffice.
 
     Raises:
         TrustboError: If the number of robots or features does not match the parameters.
     """
-    n_robots = len(z)
-    leading = params.leading
-    space = params.state_space(n_robots)
+    n_robots = len(awareness)
+    leading = draws.leading
+    space = draws.state_space(n_robots)
 
     def of_draws(values: np.ndarray) -> np.ndarray:
         """Give values (draw, ...) the leading axes of the parameters."""
@@ -71,10 +78,10 @@ def trust_recursion(
     # Expected trust is x_k = A (x_{k-1} - o_{k-1}) + u_k + o_k. Inputs either all are a drift u, or
     # all are an offset o, in which case the expected state d = x - o stays 0.
     transition = of_draws(space.over_robots(n_robots))
-    if not params.carried:
+    if not draws.carried:
         transition = np.zeros_like(transition)
 
-    start = np.asarray(params.x0_mean if x0 is None else x0, dtype=float)
+    start = np.asarray(draws.x0_mean if x0 is None else x0, dtype=float)
     if x0 is None or not start.ndim:
         start = start[..., None]
 
@@ -87,73 +94,46 @@ def trust_recursion(
         ) from None
 
     noise_sd = of_draws(space.rate_sd.mean((1, 2)))
-    if params.BY_ROBOT or by_robot:
-        return Recursion(transition, drift(params, z), start, noise_sd)
+    if draws.by_robot or by_robot:
+        drift = draws.inputs(awareness, bounds)
+        shape = (*leading, n_robots, *drift.shape[len(leading) + 1 :])
+        return Recursion(transition, np.broadcast_to(drift, shape), start, noise_sd)
 
     # With a common beta0, the mean trust of the robots obeys the same equation.
-    if n_robots > 1:
-        z = z.mean(0, keepdims=True)
     return Recursion(
         transition=transition[..., :1, :1],
-        drift=drift(params, z).mean(-4, keepdims=True),  # place effects may differ between robots
+        drift=draws.team_inputs(awareness, bounds),
         start=start.mean(-1, keepdims=True),
         noise_sd=noise_sd,
     )
 
 
-def drift(params: Params, awareness: np.ndarray) -> np.ndarray:
-    """Compute the drift u = sum_m beta_m z_m + b of each bound, (..., robot, move, row, col).
-
-    The drift includes any place effects. For a path, pass parameters from `params.along(path)`.
-
-    Args:
-        params: Parameters of any model, with leading axes (...,).
-        awareness: Situational awareness, shape (robot, move, row, col, feature).
-
-    Raises:
-        TrustboError: If the number of robots, features or cells does not match the parameters.
-    """
-    check_params(params, None if params.places else len(awareness), awareness.shape[-1])
-    u = params.increments(awareness)
-    b = np.asarray(params.b, dtype=float)
-    if not params.BY_ROBOT and b.ndim <= len(params.leading):
-        b = b[..., None]
-    if b.ndim == len(params.leading) + 3:  # (..., 1, bound, robot), along a path
-        return u + np.swapaxes(b[..., 0, :, :], -1, -2)[..., None, None, :]
-
-    u += b[..., None, None, None]  # in place, because the array can be large
-    for name, effect in params.places.items():
-        if effect.shape[-2:] != u.shape[-2:]:
-            raise TrustboError(
-                f"params.{name} has the grid shape {effect.shape[-2:]}, but the awareness has "
-                f"{u.shape[-2:]}. For the awareness along a path, use params.along(path)."
-            )
-        if name == "place":  # the effect of a cell is the same for all moves that enter it
-            effect = effect[..., None, :, :]
-        u = u + effect
-
-    return u
-
-
-def expected_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = None) -> np.ndarray:
+def expected_trust(
+    params: Draws,
+    awareness: ArrayLike,
+    x0: ArrayLike | None = None,
+    *,
+    path: Sequence[Cell] | np.ndarray | None = None,
+) -> np.ndarray:
     """Compute expected trust along a path from equations (1) and (3) without noise.
 
     Args:
-        params: Parameters of any model, with leading axes (...,) such as (draw,). With place
-            effects, pass `params.along(path)`.
+        params: Parameters of any model, with leading axes (...,) such as (draw,).
         awareness: Situational awareness along the path, shape (bound, robot, feature).
         x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default
             `params.x0_mean`.
+        path: Cells of the path, start first; needed with place effects.
 
     Returns:
         Expected trust after each bound, shape (..., bound, robot).
 
     Raises:
-        TrustboError: If the number of robots or features does not match the parameters, or place
-            effects are given for the grid instead of the path.
+        TrustboError: If the number of robots or features does not match the parameters, the path
+            has another length, or there are place effects and no path is given.
     """
-    require_kind("params", params, Params, "give parameters, such as TrustParams(...)")
-    require_values(params)
+    require_kind("params", params, Draws, "give parameters, such as TrustParams(...)")
+    if isinstance(params, ParameterDraws):
+        require_values(params)  # pyright: ignore[reportArgumentType]
 
     dims = ("bound", "robot", "feature")
     unnamed = {"robot": None, "feature": None}
@@ -163,13 +143,23 @@ def expected_trust(params: Params, awareness: ArrayLike, x0: ArrayLike | None = 
     if x0 is not None:
         x0 = require_numbers("x0", x0)
 
+    bounds = np.full((len(z), 3), -1)
+    if path is not None:
+        bounds = bounds_along(path)
+    elif params.grid_shape is not None:
+        raise TrustboError("the parameters have place effects; give the cells with path=.")
+    if len(bounds) != len(z):
+        raise TrustboError(
+            f"path must have {len(z) + 1} cells for {len(z)} bounds; got {len(bounds) + 1}."
+        )
+
     of_robots = np.swapaxes(z, 0, 1)
-    return states_along(trust_recursion(params, of_robots[:, None, None], x0, by_robot=True))
+    return states_along(trust_recursion(params, of_robots, x0, bounds=bounds, by_robot=True))
 
 
 def states_along(along: Recursion) -> np.ndarray:
-    """Compute expected trust (..., bound, state) after each bound of `Recursion.along(path)`."""
-    drift = np.moveaxis(along.drift[..., 0, 0, :], -1, 0)  # (bound, ..., state)
+    """Compute expected trust (..., bound, state) after each bound of a path."""
+    drift = np.moveaxis(along.drift, -1, 0)  # (bound, ..., state)
     trust = [along.start]
     for u in drift:
         trust.append(kalman.step(along.transition, trust[-1], u))

@@ -5,7 +5,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
-from trustbo.models.params import Params
+from trustbo.models.draws import Draws
 from trustbo.planning.objectives import TERMINAL, weights_of
 from trustbo.planning.paths import SIMPLE_EXTRA, STEPS, AdmissiblePaths
 from trustbo.planning.problem import Problem
@@ -14,7 +14,7 @@ from trustbo.planning.sums import best_sums
 
 
 def trust_map(
-    problem: Problem, params: Params, *, per_robot: bool = False, x0: ArrayLike | None = None
+    problem: Problem, params: Draws, *, per_robot: bool = False, x0: ArrayLike | None = None
 ) -> xr.DataArray:
     """Compute the trust map; see `Planner.trust_map`."""
     recursion = problem.recursion(params, x0, by_robot=per_robot).flat()

@@ -9,8 +9,9 @@ from trustbo.arrays import read_labelled
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.models import PooledTrust
+from trustbo.models.draws import Draws
 from trustbo.models.model import TrustModel
-from trustbo.models.params import Params, check_params
+from trustbo.models.params import ParameterDraws, check_params
 from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.statespace import kalman
 from trustbo.streams import stream
@@ -30,7 +31,7 @@ class ModelSimulator(DescribedSimulator):
     def __init__(
         self,
         workspace: Workspace,
-        params: Params,
+        params: Draws,
         model: TrustModel | None = None,
         *,
         awareness: ArrayLike | None = None,
@@ -56,59 +57,70 @@ class ModelSimulator(DescribedSimulator):
                 [0, 1], or `n_ticks` is missing or not used.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-        require_kind("params", params, Params, "give parameters, such as TrustParams(...)")
-        self.workspace, self.params = workspace, params
+        require_kind("params", params, Draws, "give parameters, such as TrustParams(...)")
+        self.workspace = workspace
+        self.params = params
         self.model = PooledTrust() if model is None else model
+
         shape = workspace.awareness.shape
         self.awareness = workspace.awareness.values
         if awareness is not None:
             self.awareness = read_labelled("awareness", awareness, *_labels_of(workspace)).values
         if self.awareness.shape != shape:
             raise TrustboError(f"awareness must have shape {shape}; got {self.awareness.shape}.")
+
         if params.leading:
             raise TrustboError(f"params must be a single draw; got leading axes {params.leading}.")
-        check_params(params, shape[0], shape[-1])
+        if isinstance(params, ParameterDraws):
+            check_params(params, shape[0], shape[-1])  # pyright: ignore[reportArgumentType]
+
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
         if (self.n_ticks is not None) != self.model.likelihood.needs_ticks:
             needs = "needs" if self.model.likelihood.needs_ticks else "does not use"
             raise TrustboError(
                 f"family {self.model.likelihood.name!r} {needs} n_ticks; got {n_ticks}."
             )
-        bounds = shape[1:4]
-        self.p_fail = None if p_fail is None else _require_probabilities(p_fail, bounds)
+
+        self.p_fail = None if p_fail is None else _require_probabilities(p_fail, shape[1:4])
 
     def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
         """Run a path; the result depends on the seed, but not on the number of the mission."""
         cells = require_path(self.workspace, path)
-        z = np.swapaxes(along(self.awareness, cells), 0, 1)
+        z = along(self.awareness, cells)  # (robot, bound, feature)
+        n_robots, n_bounds = z.shape[:2]
         # Without _STREAM, seed 0 would give the same numbers as `default_rng(0)`.
         rng = np.random.default_rng([0, require_whole("seed", seed, 0), _STREAM])
-        of_bounds = np.full(z.shape[:2], np.nan if self.n_ticks is None else self.n_ticks)
+
         params = self.params.flat()
-        space = params.state_space(z.shape[1], adds_noise=self.model.likelihood.adds_noise)
-        u = np.stack([params.of_bound(of_bound) for of_bound in z])  # (bound, draw, robot)
-        if params.places:
-            u = u + np.moveaxis(params.of_places(bounds_along(cells)), -2, 0)
-        inputs = [params.inputs(space.grouped(of_bound)) for of_bound in u]
+        space = params.state_space(n_robots, adds_noise=self.model.likelihood.adds_noise)
+        u = params.inputs(z, bounds_along(cells))
+        u = np.broadcast_to(u, (1, n_robots, n_bounds))
+        inputs = [params.as_inputs(space.grouped(u[..., k])) for k in range(n_bounds)]
 
         offset = np.broadcast_to(params.initial_offset, 1)[:, None, None]
-        start = kalman.initial(space, z.shape[1] // space.n_members, offset)
-        ticks = space.grouped(of_bounds)
+        start = kalman.initial(space, n_robots // space.n_members, offset)
+        counts = np.full((n_bounds, n_robots), np.nan if self.n_ticks is None else self.n_ticks)
+        ticks = space.grouped(counts)
         drawn = kalman.forecast(space, start, inputs, ticks, self.model.likelihood, rng)
-        rates = np.clip([of_bound[0] for _, of_bound in drawn], 0.0, 1.0)
+        rates = np.clip([of_robots[0] for _, of_robots in drawn], 0.0, 1.0)
+
         n, status = self._end(cells, seed)
-        ticks = None if self.n_ticks is None else np.full(rates[:n].shape, self.n_ticks)
         return Mission.from_arrays(
-            cells, z[:n], rates[:n], status=status, n_ticks=ticks,
-            features=self.workspace.features, robots=self.workspace.team.names,
-        )  # fmt: skip
+            cells,
+            np.swapaxes(z, 0, 1)[:n],
+            rates[:n],
+            status=status,
+            n_ticks=None if self.n_ticks is None else counts[:n],
+            features=self.workspace.features,
+            robots=self.workspace.team.names,
+        )
 
     def describe(self) -> dict[str, object]:
         """Return the model and its true parameters."""
         about: dict[str, object] = {
             "simulator": type(self).__name__,
             "simulator_model": self.model.in_short(),
-            "truth": {n: np.asarray(value).tolist() for n, value in self.params.by_name.items()},
+            "truth": self.params.record(),
         }
         if self.p_fail is not None:
             about["p_fail"] = np.nan_to_num(self.p_fail, nan=-1.0).tolist()
@@ -136,6 +148,7 @@ def _require_probabilities(p_fail: ArrayLike, shape: tuple[int, ...]) -> np.ndar
     p = read_labelled("p_fail", p_fail, ("move", "row", "col"), {"move": MOVE_NAMES}).values
     if p.shape != shape:
         raise TrustboError(f"p_fail must have the shape (move, row, col) = {shape}; got {p.shape}.")
-    if (bad := (p < 0.0) | (p > 1.0)).any():
+    bad = (p < 0.0) | (p > 1.0)
+    if bad.any():
         raise TrustboError(f"p_fail must be in [0, 1]; got {p[bad][0]:g}.")
     return p

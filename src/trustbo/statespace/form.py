@@ -158,8 +158,8 @@ def independent_robots(
             robot).
         delta_w: Standard deviation of the process noise, shaped like `beta0`.
         delta_v: Standard deviation of the observation noise, shaped like `beta0`.
-        x0_mean: Mean of the state before the first bound, shape () or (point,).
-        x0_sd: Standard deviation of the state before the first bound, shape () or (point,).
+        x0_mean: Mean of the state before the first bound, shape (), (point,) or (point, robot).
+        x0_sd: Standard deviation of the state before the first bound, of the same shapes.
         delta_s: Standard deviation of the noise s that all robots share, shape (point,), or None.
         n_members: 1 for groups of one robot, or the number of robots for one group of all robots,
             as is needed with `delta_s`.
@@ -208,8 +208,8 @@ def coupled_robots(
         B0: Transition matrix, shape (point, robot, robot).
         Delta_w: Covariance of the process noise, shape (point, robot, robot).
         Delta_v: Covariance of the observation noise, shape (point, robot, robot).
-        x0_mean: Mean of trust before the first bound, shape () or (point,).
-        x0_sd: Standard deviation of trust before the first bound, shape () or (point,).
+        x0_mean: Mean of trust before the first bound, shape (), (point,) or (point, robot).
+        x0_sd: Standard deviation of trust before the first bound, of the same shapes.
         adds_noise: Whether the observation family adds noise to the linear predictor; otherwise
             Delta_v is diagonal and robots share no noise.
     """
@@ -237,5 +237,7 @@ def coupled_robots(
 
 
 def _per_point(values: Any) -> Any:
-    """Give a number or values (point,) the axes (point, group, member)."""
-    return values if np.ndim(values) == 0 else values[:, None, None]
+    """Give a number or values (point,) or (point, robot) the axes (point, group, member)."""
+    if np.ndim(values) == 0:
+        return values
+    return values.reshape(len(values), 1, -1)

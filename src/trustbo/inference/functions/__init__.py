@@ -1,0 +1,1 @@
+"""Models that are NumPyro functions: their data, draws, sampler and posterior."""

@@ -1,0 +1,98 @@
+"""Inputs of a model that is a NumPyro function, by the names of its parameters."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from trustbo.data import Mission
+from trustbo.models.observations import Observations
+from trustbo.workspace.moves import bounds_along
+
+RATES = "contact_rate"
+"""Name of the site, and of the input, with the contact rates."""
+NAMES = ("awareness", RATES, "n_ticks", "duration", "cell", "bound", "observations")
+"""Names of all inputs; `observations` are all data as `Observations`, without padding."""
+_STEP_OF_BOUNDS = 8
+"""Bounds are padded to a multiple of this number, so that few shapes are compiled."""
+_FEWEST_MISSIONS = 4
+"""Missions are padded to a power of 2 that is at least this number."""
+_UNKNOWN = -1
+"""Index of an unknown cell or move."""
+
+Data = Mapping[str, Any]
+"""Inputs by name.
+
+The shapes are awareness (mission, bound, robot, feature); contact_rate, n_ticks and duration
+(mission, bound, robot); cell (mission, bound, 2), with rows and columns; and bound (mission, bound,
+3), with moves, rows and columns.
+"""
+
+
+def data_of(missions: Sequence[Mission], observations: Observations) -> dict[str, np.ndarray]:
+    """Return the inputs of missions, padded so that a function is compiled for few shapes.
+
+    In the padding, contact_rate, n_ticks and duration are NaN, awareness is 0, and indices are -1.
+    """
+    n_missions, n_bounds = observations.contact_rate.shape[:2]
+    missing = (
+        (0, _power_of_two(n_missions) - n_missions),
+        (0, -n_bounds % _STEP_OF_BOUNDS),
+    )
+
+    duration = np.full(observations.contact_rate.shape, np.nan)
+    bound = np.full((n_missions, n_bounds, 3), _UNKNOWN)
+    for j, mission in enumerate(missions):
+        driven = slice(len(mission.bounds))
+        duration[j, driven] = mission.duration
+        if mission.path:
+            bound[j, driven] = bounds_along(mission.path)[: len(mission.bounds)]
+
+    def padded(values: np.ndarray, fill: float) -> np.ndarray:
+        margin = [*missing, *[(0, 0)] * (values.ndim - 2)]
+        return np.pad(values, margin, constant_values=fill)
+
+    return {
+        "awareness": padded(observations.awareness, 0.0),
+        RATES: padded(observations.contact_rate, np.nan),
+        "n_ticks": padded(observations.n_ticks, np.nan),
+        "duration": padded(duration, np.nan),
+        "cell": padded(bound[..., 1:], _UNKNOWN),
+        "bound": padded(bound, _UNKNOWN),
+    }
+
+
+def data_of_bounds(awareness: np.ndarray, bounds: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the inputs of bounds as one mission without contact rates, padded as in `data_of`.
+
+    Args:
+        awareness: Awareness, shape (bound, robot, feature), without NaN.
+        bounds: Moves, rows and columns, shape (bound, 3).
+    """
+    n_bounds, n_robots, n_features = awareness.shape
+    n_padded = n_bounds + -n_bounds % _STEP_OF_BOUNDS
+
+    z = np.zeros((1, n_padded, n_robots, n_features))
+    z[0, :n_bounds] = awareness
+    indices = np.full((1, n_padded, 3), _UNKNOWN)
+    indices[0, :n_bounds] = bounds
+    unmeasured = np.full((1, n_padded, n_robots), np.nan)
+
+    return {
+        "awareness": z,
+        RATES: unmeasured,
+        "n_ticks": unmeasured,
+        "duration": unmeasured,
+        "cell": indices[..., 1:],
+        "bound": indices,
+    }
+
+
+def observations_of(data: Data, features: tuple[str, ...]) -> Observations:
+    """Return inputs as `Observations`."""
+    return Observations(data[RATES], data["awareness"], data["n_ticks"], features)
+
+
+def _power_of_two(n: int) -> int:
+    """Return the smallest power of 2 that is at least n and `_FEWEST_MISSIONS`."""
+    return max(_FEWEST_MISSIONS, 1 << (n - 1).bit_length())

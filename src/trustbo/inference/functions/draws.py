@@ -1,0 +1,303 @@
+"""Draws of a model that is a NumPyro function."""
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from typing import Any
+
+import jax
+import numpy as np
+
+from trustbo.errors import TrustboError
+from trustbo.inference.functions.data import Data, data_of_bounds, observations_of
+from trustbo.inference.functions.function import FunctionModel
+from trustbo.models.backend import own_settings
+from trustbo.models.draws import Draws
+from trustbo.statespace import Inputs, StateSpace
+
+_NUMBERS = 4_000_000
+"""Most inputs that are computed at once."""
+_SEED = 20261126
+"""Seed of variables of one mission each, which are drawn for the next mission."""
+_SAME = 1e-9
+"""Largest difference, relative to the largest input, of inputs that should be equal."""
+_N_CHECKED = 2
+"""Draws for which `require_plannable` runs the function."""
+
+
+class FunctionDraws(Draws):
+    """Draws of the variables of a function, or the mean of the form and inputs over these draws.
+
+    The inputs of bounds are found by running the function on these bounds as one mission.
+
+    Attributes:
+        model: The function.
+        values: Draws (draw, ...) of its variables by name.
+        robots: Names of the robots.
+        features: Names of the features.
+        shape: Number of rows and columns of the map; None without a map.
+    """
+
+    __slots__ = (
+        "_form",
+        "_is_flat",
+        "_numbers",
+        "_of_mean",
+        "features",
+        "model",
+        "robots",
+        "shape",
+        "values",
+    )
+
+    def __init__(
+        self,
+        model: FunctionModel,
+        values: Mapping[str, np.ndarray],
+        robots: Sequence[str],
+        features: Sequence[str],
+        shape: tuple[int, int] | None,
+    ) -> None:
+        """Store the draws; `values` does not include variables of one mission each."""
+        self.model = model
+        self.values = dict(values)
+        self.robots = tuple(robots)
+        self.features = tuple(features)
+        self.shape = shape
+        self._numbers = np.arange(len(next(iter(self.values.values()))))  # of the random keys
+        self._of_mean = False
+        self._is_flat = True  # whether a mean has a leading axis
+        self._form: StateSpace | None = None
+
+    def __repr__(self) -> str:
+        what = "mean of " if self._of_mean else ""
+        return f"FunctionDraws({what}{len(self._numbers)} draws of {self.model.in_short()})"
+
+    @property
+    def leading(self) -> tuple[int, ...]:
+        """See `Draws.leading`."""
+        if self._of_mean:
+            return (1,) if self._is_flat else ()
+        return self._numbers.shape
+
+    @property
+    def n_robots(self) -> int:
+        """Number of robots."""
+        return len(self.robots)
+
+    @property
+    def n_features(self) -> int:
+        """Number of features."""
+        return len(self.features)
+
+    @property
+    def by_robot(self) -> bool:
+        """See `Draws.by_robot`."""
+        transition = self._space.transition
+        return transition.shape[-1] > 1 or transition.shape[1] > 1
+
+    @property
+    def grid_shape(self) -> tuple[int, int] | None:
+        """See `Draws.grid_shape`."""
+        depends = {"cell", "bound"} & {*self.model.inputs}
+        return self.shape if depends else None
+
+    @property
+    def carried(self) -> bool:
+        """Inputs are carried over to later bounds."""
+        return True
+
+    @property
+    def x0_mean(self) -> Any:
+        """Mean of trust before the first bound, shape (draw,) or (); averaged over robots."""
+        mean = self._space.initial_mean.mean((1, 2))
+        return mean.reshape(self.leading)
+
+    @property
+    def _space(self) -> StateSpace:
+        """State-space form of each draw or of the mean, which depends on no bound."""
+        if self._form is None:
+            nothing = np.zeros((1, self.n_robots, self.n_features))
+            data = self._data(nothing, np.full((1, 3), -1))
+            space, _ = self._run(self._flat_values(), np.atleast_1d(self._numbers), data)
+            if self._of_mean:
+                fields = [None if f is None else f.mean(0, keepdims=True) for f in space]
+                space = StateSpace(*fields)
+            self._form = space
+        return self._form
+
+    def state_space(self, n_robots: int, *, adds_noise: bool = True) -> StateSpace:
+        """See `Draws.state_space`."""
+        if n_robots != self.n_robots:
+            raise TrustboError(f"the draws are of {self.n_robots} robots, not {n_robots}.")
+        return self._space
+
+    def inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
+        """Compute the inputs of bounds by running the function; see `Draws.inputs`.
+
+        Raises:
+            TrustboError: If the function fails, or an input is not finite.
+        """
+        shape = awareness.shape[1:-1]
+        z = awareness.reshape(self.n_robots, -1, self.n_features).swapaxes(0, 1)
+        if bounds is None:
+            bounds = np.indices(shape).reshape(3, -1).T
+
+        known = ~np.isnan(z).any((1, 2))
+        drift = np.full((*self.leading, self.n_robots, len(z)), np.nan)
+        drift[..., known] = self._drift(z[known], bounds[known])
+        return drift.reshape(*self.leading, self.n_robots, *shape)
+
+    def _drift(self, z: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+        """Compute the drift (..., robot, bound); `z` has the shape (bound, robot, feature)."""
+        data = self._data(z, bounds)
+        values = self._flat_values()
+        numbers = np.atleast_1d(self._numbers)
+        n_draws = len(numbers)
+        size = max(1, _NUMBERS // data["awareness"][..., 0].size)
+
+        parts = []
+        for first in range(0, n_draws, size):
+            some = slice(first, first + size)
+            chosen = {name: v[some] for name, v in values.items()}
+            _, inputs = self._run(chosen, numbers[some], data)
+            drift = _by_robot(inputs)[:, 0, : len(z)].swapaxes(1, 2)
+            parts.append(drift.sum(0, keepdims=True) if self._of_mean else drift)
+
+        drift = np.concatenate(parts)
+        if self._of_mean:
+            drift = drift.sum(0) / n_draws
+        return drift.reshape(*self.leading, self.n_robots, len(z))
+
+    def _run(
+        self, values: dict[str, np.ndarray], numbers: np.ndarray, data: Data
+    ) -> tuple[StateSpace, Inputs]:
+        """Run the function; return the form (draw, group, member) and the inputs."""
+        with own_settings():
+            keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(_SEED), numbers)
+        space, inputs = self.model.over_draws("form", 2, data)(values, keys)
+
+        offset = np.any(inputs.offset)
+        if offset or not np.isfinite(inputs.drift).all():
+            reason = "has an offset" if offset else "has a drift that is not finite"
+            raise TrustboError(
+                f"{self.model.in_short()} {reason} in some bounds, and such a model cannot plan. "
+                "The inputs n_ticks and duration are not known before a mission."
+            )
+
+        fields = [None if value is None else value[:, 0] for value in space]
+        return StateSpace(*fields), inputs
+
+    def _data(self, z: np.ndarray, bounds: np.ndarray) -> dict[str, Any]:
+        """Return the inputs of bounds; `z` has the shape (bound, robot, feature)."""
+        data: dict[str, Any] = data_of_bounds(z, bounds)
+        if self.model.needs_observations:
+            data["observations"] = observations_of(data, self.features)
+        return data
+
+    def _flat_values(self) -> dict[str, np.ndarray]:
+        """Return the draws with exactly one leading axis (draw,)."""
+        if self._numbers.ndim:
+            return self.values
+        return {name: values[None] for name, values in self.values.items()}
+
+    def require_plannable(self, awareness: np.ndarray) -> None:
+        """Raise TrustboError if the drift of a bound depends on anything but this bound.
+
+        The function runs on the bounds of the map as one mission, and on half of them, in another
+        order, as two missions. The drift of a bound must be the same.
+
+        Args:
+            awareness: Awareness of the map, shape (robot, move, row, col, feature).
+        """
+        some = self._some(np.arange(min(_N_CHECKED, self._numbers.size)))
+        z = awareness.reshape(self.n_robots, -1, self.n_features).swapaxes(0, 1)
+        bounds = np.indices(awareness.shape[1:-1]).reshape(3, -1).T
+        known = ~np.isnan(z).any((1, 2))
+        z = z[known]
+        bounds = bounds[known]
+
+        # Variables of one mission each are the same in all runs.
+        data = some._data(z, bounds)
+        of_missions = some._drawn_for_mission(data)
+        _, inputs = some._run(some.values | of_missions, some._numbers, data)
+        wanted = _by_robot(inputs)[:, 0, : len(z)]
+
+        order = np.random.default_rng(0).permutation(len(z))[: max(1, len(z) // 2)]
+        data = some._data(z[order], bounds[order])
+        data.pop("observations", None)
+        n_half = data["awareness"].shape[1] // 2
+        data = {name: v[0].reshape(2, n_half, *v.shape[2:]) for name, v in data.items()}
+        if some.model.needs_observations:
+            data["observations"] = observations_of(data, some.features)
+        sites = some.model.sites(data)
+        twice = {
+            name: np.repeat(values, 2, axis=1 + (sites[name].mission_axis or 0))
+            for name, values in of_missions.items()
+        }
+        _, inputs = some._run(some.values | twice, some._numbers, data)
+        found = _by_robot(inputs).reshape(len(wanted), -1, self.n_robots)[:, : len(order)]
+
+        error = np.abs(found - wanted[:, order]).max(initial=0.0)
+        if error > _SAME * max(1.0, np.abs(wanted).max(initial=0.0)):
+            raise TrustboError(
+                f"{self.model.in_short()} cannot plan: the drift of a bound changes with the order "
+                "or the number of bounds or missions. It may depend only on the awareness, the "
+                "cell and the move of the same bound."
+            )
+
+    def _drawn_for_mission(self, data: Data) -> dict[str, np.ndarray]:
+        """Draw the variables of one mission each, for one mission, by name."""
+        sites = self.model.sites(data)
+        names = [name for name, site in sites.items() if site.mission_axis is not None]
+        if not names:
+            return {}
+
+        with own_settings():
+            keys = jax.random.split(jax.random.key(_SEED), self._numbers.size)
+        drawn = self.model.over_draws("prior", 1, data)(keys)
+        return {name: drawn[name] for name in names}
+
+    def draw(self, index: Any) -> "FunctionDraws":
+        """See `Draws.draw`."""
+        if not self._of_mean:
+            return self._some(index)
+
+        other = copy(self)
+        other._is_flat = np.ndim(index) > 0  # the mean is the only draw
+        return other
+
+    def _some(self, index: Any) -> "FunctionDraws":
+        """Return some of the draws, even of a mean."""
+        other = copy(self)
+        other.values = {name: values[index] for name, values in self.values.items()}
+        other._numbers = self._numbers[index]
+        other._of_mean = False
+        other._form = None
+        return other
+
+    def mean(self) -> "FunctionDraws":
+        """Average the form and the inputs over all draws; see `Draws.mean`."""
+        other = copy(self.flat())
+        if not other._of_mean:
+            other._of_mean = True
+            other._form = None
+        other._is_flat = False
+        return other
+
+    def flat(self) -> "FunctionDraws":
+        """See `Draws.flat`."""
+        other = copy(self)
+        other.values = self._flat_values()
+        other._numbers = np.atleast_1d(self._numbers)
+        other._is_flat = True
+        return other
+
+    def record(self) -> dict[str, Any]:
+        """See `Draws.record`."""
+        return {name: np.asarray(values).tolist() for name, values in self.values.items()}
+
+
+def _by_robot(inputs: Inputs) -> np.ndarray:
+    """Return the drift (draw, mission, bound, robot)."""
+    drift = inputs.drift
+    return drift.reshape(*drift.shape[:3], -1)

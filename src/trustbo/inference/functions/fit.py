@@ -1,0 +1,503 @@
+"""Fit a model that is a NumPyro function, and complete its posterior."""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+
+from trustbo.data import Mission
+from trustbo.display import slow_bar
+from trustbo.errors import TrustboError, require_kind
+from trustbo.inference.diagnostics import complaints_of
+from trustbo.inference.draws import joined_draws
+from trustbo.inference.functions.data import Data, data_of, data_of_bounds, observations_of
+from trustbo.inference.functions.draws import FunctionDraws
+from trustbo.inference.functions.function import Found, FunctionModel, Site, as_model
+from trustbo.inference.functions.nuts import (
+    Sampler,
+    Samples,
+    Start,
+    cold_start,
+    coordinates_of,
+    free_shapes,
+    joined_samples,
+    warm_start,
+)
+from trustbo.inference.tree import N_PRIOR, kept_draws, to_datatree
+from trustbo.models.backend import VERSIONS, own_settings
+from trustbo.models.families import FAMILIES
+from trustbo.models.observations import Observations
+from trustbo.statespace import kalman
+from trustbo.statespace.form import Inputs, StateSpace
+from trustbo.streams import stream
+from trustbo.workspace import Workspace
+
+__all__ = ["as_model", "fit_function", "with_latent_of_function"]
+
+_WARMUP = 300
+"""Warm-up draws per chain of each run of NUTS, which are discarded."""
+_ACCEPT = 0.95
+"""Target of the acceptance probability."""
+_LAST_ACCEPT = 0.99
+"""The same after a divergent transition."""
+_ATTEMPTS = 4
+"""Most runs of NUTS."""
+_SIZE = 200
+"""Draws whose latent trust is drawn at once."""
+_STATS = {
+    "num_steps": "n_steps",
+    "diverging": "diverging",
+    "accept_prob": "acceptance_rate",
+    "energy": "energy",
+    "potential_energy": "lp",
+}
+"""ArviZ names of NumPyro's statistics."""
+
+
+def fit_function(
+    missions: Sequence[Mission],
+    model: FunctionModel,
+    workspace: Workspace | None,
+    draws: int,
+    chains: int,
+    warmup: int | None,
+    seed: int,
+    progress: bool,
+    start: xr.DataTree | None,
+) -> tuple[xr.DataTree, list[str]]:
+    """Fit a function to missions with NUTS; for the arguments, see `trustbo.fit`.
+
+    If the diagnostics are bad, NUTS goes on; see `_sampled`.
+
+    Returns:
+        The posterior of the parameters, and a list of failed checks.
+
+    Raises:
+        TrustboError: If the function cannot be a model of these missions.
+    """
+    warmup = _WARMUP if warmup is None else warmup
+    observations = Observations.from_missions(missions)
+    data = _data_for(model, missions, observations)
+    sites = model.sites(data)
+    if workspace is not None:
+        require_plannable(model, workspace, data)
+
+    first = _start(model, sites, data, start, chains, seed)
+    samples, found, complaints = _sampled(
+        model, data, sites, first, warmup, draws, seed=seed, progress=progress
+    )
+    stats = {ours: samples.fields[theirs] for theirs, ours in _STATS.items()}
+    stats["lp"] = -stats["lp"]  # NumPyro's potential is -log density
+
+    flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in samples.z.items()}
+    values = model.over_draws("constrain", 1, data)(flat)
+    by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
+
+    n_missions = len(missions)
+    variables = {
+        name: _without_padding(values, sites[name], n_missions) for name, values in by_chain.items()
+    }
+    tree = _tree(model, variables, sites, stats, missions, data, seed)
+    tree.attrs |= {
+        "model": model.name,
+        "model_record": model.text,
+        "family": model.family,
+        "n_robots": observations.n_robots,
+        "n_missions": n_missions,
+        "robots": list(missions[0].robots),
+        "features": list(missions[0].features),
+        "sampler": "nuts",
+        "seed": seed,
+        "step_size": samples.step_size,
+        **found,
+        **{f"{name}_version": version for name, version in VERSIONS.items()},
+    }
+
+    return tree, complaints
+
+
+def with_latent_of_function(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission],
+    model: FunctionModel,
+    *,
+    progress: bool = True,
+) -> xr.DataTree:
+    """Add latent trust, log-likelihoods and predictions to a posterior of a function."""
+    observations = Observations.from_missions(missions)
+    data = _data_for(model, missions, observations)
+    sites = model.sites(data)
+    values = _padded_values(posterior, sites)
+    n_draws = len(next(iter(values.values())))
+    n_chains = posterior["posterior"].sizes["chain"]
+    n_missions = len(missions)
+    seed = posterior.attrs["seed"]
+
+    kept, some = kept_draws(posterior)
+    rng = stream(seed, "latent of a function")
+    evaluate = model.over_draws("evaluate", 2, data)
+    keys = _keys(n_draws, seed)
+
+    shape = observations.contact_rate.shape
+    mean = np.zeros(shape)
+    square = np.zeros(shape)
+    log_likelihood = np.empty((n_draws, n_missions))
+    log_prior: dict[str, list[np.ndarray]] = {}
+    of_counts = True
+    trust = np.empty((n_draws, *shape))
+    predicted = np.empty((n_draws, *shape))
+    with slow_bar("latent trust", " draws", progress, total=n_draws) as bar:
+        for begin in range(0, n_draws, _SIZE):
+            where = slice(begin, begin + _SIZE)
+            found: Found = evaluate({n: v[where] for n, v in values.items()}, keys[where])
+            of_counts = bool(found.of_counts.all())
+            log_likelihood[where] = found.log_likelihood[:, :n_missions]
+            for name, of_site in found.log_prior.items():
+                log_prior.setdefault(name, []).append(of_site)
+
+            space, inputs = _form_of(found, n_missions, shape[1])
+            trust[where] = _drawn_trust(space, inputs, observations, rng)
+            predicted[where] = _replicated(space, inputs, observations, rng)
+            mean += trust[where].sum(0) / n_draws
+            square += (trust[where] ** 2).sum(0) / n_draws
+            bar.update(len(found.log_likelihood))
+
+    is_measured = ~np.isnan(observations.contact_rate)
+    is_counted = observations.n_ticks > 0.0
+    of_counts = of_counts and bool((is_counted | ~is_measured).all())
+
+    def by_chain(array: np.ndarray) -> np.ndarray:
+        return array.reshape(n_chains, -1, *array.shape[1:])
+
+    groups = {
+        "log_likelihood": {"contact_rate": by_chain(log_likelihood)},
+        "latent": {
+            "trust": by_chain(trust[some]),
+            "trust_mean": mean,
+            "trust_sd": np.sqrt(np.maximum(square - mean**2, 0.0)),
+            "draw": kept,
+        },
+        "posterior_predictive": {"contact_rate": by_chain(predicted[some]), "draw": kept},
+        "prior_predictive": {"contact_rate": _prior_predictive(model, data, observations, seed)},
+        "log_prior": {n: by_chain(np.concatenate(parts)) for n, parts in log_prior.items()},
+    }
+    added = to_datatree(groups, missions, {})
+    parts = {**posterior.children, **added.children}
+    whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
+    whole.attrs = posterior.attrs | {"log_likelihood_of": "ticks" if of_counts else "contact_rate"}
+    return whole
+
+
+def draws_of_function(
+    model: FunctionModel, posterior: xr.DataTree, workspace: Workspace | None
+) -> FunctionDraws:
+    """Return the draws of a posterior of a function, for the bounds of a workspace.
+
+    Raises:
+        TrustboError: If the robots or features of the workspace are others, or in another order.
+    """
+    robots = tuple(posterior.attrs["robots"])
+    features = tuple(posterior.attrs["features"])
+    shape: Any = None
+    if workspace is not None:
+        require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
+        has = {"robots": workspace.team.names, "features": workspace.features}
+        for what, names in {"robots": robots, "features": features}.items():
+            if tuple(has[what]) != names:
+                raise TrustboError(
+                    f"{model.in_short()} was fitted to missions with the {what} "
+                    f"{', '.join(names)}; the workspace has {', '.join(has[what])}. A function "
+                    "reads them by place, so give the same ones in the same order."
+                )
+        shape = workspace.passable.shape
+
+    draws = posterior["posterior"].to_dataset()
+    names = json.loads(draws.attrs["common"])
+    missing = [name for name in names if safe(name) not in draws]
+    if missing:
+        raise TrustboError(
+            f"the posterior has no variable {missing[0]!r}, only {', '.join(map(str, draws))}. "
+            "Give a posterior from trustbo.fit with unchanged names."
+        )
+
+    values = {name: joined_draws(draws[safe(name)]) for name in names}
+    bad = [name for name, array in values.items() if np.isnan(array).any()]
+    if bad:
+        raise TrustboError(
+            f"draws of {bad[0]!r} are NaN; drop these draws with posterior.isel(draw=...) instead "
+            "of masking them."
+        )
+    return FunctionDraws(model, values, robots, features, shape)
+
+
+def prior_draws_of_function(
+    model: FunctionModel, n_draws: int, seed: int, workspace: Workspace
+) -> FunctionDraws:
+    """Draw the variables of a function from the prior, for the bounds of a workspace."""
+    awareness = workspace.awareness.values
+    n_robots, _, rows, cols, n_features = awareness.shape
+    features = tuple(workspace.features)
+    data = _nothing(model, n_robots, n_features, features)
+    sites = model.sites(data)
+
+    drawn = model.over_draws("prior", 1, data)(_keys(n_draws, seed))
+    values = {name: drawn[name] for name, site in sites.items() if site.mission_axis is None}
+    if not values:
+        raise TrustboError(f"{model.in_short()} has no variable that is common to all missions.")
+    return FunctionDraws(model, values, workspace.team.names, features, (rows, cols))
+
+
+def require_plannable(model: FunctionModel, workspace: Workspace, data: Data | None = None) -> None:
+    """Raise TrustboError if a function cannot plan in a workspace."""
+    draws = prior_draws_of_function(model, 2, 0, workspace)
+    draws.require_plannable(workspace.awareness.values)
+
+
+def _data_for(
+    model: FunctionModel, missions: Sequence[Mission], observations: Observations
+) -> dict[str, Any]:
+    """Return the inputs of a function; data that it takes as one object are not padded."""
+    data: dict[str, Any] = data_of(missions, observations)
+    if model.needs_observations:
+        n_missions, n_bounds = observations.contact_rate.shape[:2]
+        data = {name: values[:n_missions, :n_bounds] for name, values in data.items()}
+        data["observations"] = observations
+    return data
+
+
+def _nothing(
+    model: FunctionModel, n_robots: int, n_features: int, features: tuple[str, ...]
+) -> dict[str, Any]:
+    """Return the inputs of one mission of one bound without contact rates."""
+    data: dict[str, Any] = data_of_bounds(np.zeros((1, n_robots, n_features)), np.full((1, 3), -1))
+    if model.needs_observations:
+        data["observations"] = observations_of(data, features)
+    return data
+
+
+def _sampler(model: FunctionModel) -> Sampler:
+    """Return the sampler of a function, with what was compiled for it before."""
+    if model.sampler is None:
+        model.sampler = Sampler(model)
+    return model.sampler
+
+
+def _sampled(
+    model: FunctionModel,
+    data: Data,
+    sites: Mapping[str, Site],
+    start: Start,
+    warmup: int,
+    draws: int,
+    *,
+    seed: int,
+    progress: bool,
+) -> tuple[Samples, dict[str, float], list[str]]:
+    """Run NUTS until the diagnostics are good, at most `_ATTEMPTS` times.
+
+    Each run starts from draws of the run before. Draws of runs without divergent transitions are
+    joined, and as many as were asked for are kept, evenly spaced. After a divergence, earlier draws
+    are discarded, and steps are smaller.
+
+    Returns:
+        Samples, their diagnostics, and the failed checks of the last attempt.
+    """
+    sampler = _sampler(model)
+    accept = _ACCEPT
+    runs: list[Samples] = []
+    attempt = 0
+    while True:
+        last = sampler.sample(
+            data,
+            sites,
+            start,
+            warmup,
+            draws,
+            accept=accept,
+            seed=int(np.random.SeedSequence([seed, attempt]).generate_state(1)[0]),
+            progress=progress,
+        )
+        if last.fields["diverging"].any():
+            runs = []
+            accept = _LAST_ACCEPT
+
+        joined = joined_samples([*runs, last], draws)
+        found, complaints = complaints_of(joined.z, joined.fields["diverging"])
+        attempt += 1
+        if not complaints or attempt == _ATTEMPTS:
+            return joined, found, complaints
+
+        if not last.fields["diverging"].any():
+            runs.append(last)
+        x = coordinates_of(last.z)
+        start = warm_start(x, last.step_size, len(start.x), seed + attempt)
+
+
+def _start(
+    model: FunctionModel,
+    sites: Mapping[str, Site],
+    data: Data,
+    previous: xr.DataTree | None,
+    chains: int,
+    seed: int,
+) -> Start:
+    """Return where the chains start: at draws of a previous posterior of the same function."""
+    with own_settings():
+        free = free_shapes(model, sites, data)
+    n = sum(values.size for values in free.values())
+    if previous is None or previous.attrs["model_record"] != model.text:
+        return cold_start(n, chains, seed)
+
+    draws = previous["posterior"].to_dataset()
+    values = {name: joined_draws(draws[safe(name)]) for name in sites}
+    if any(site.mission_axis is not None for site in sites.values()):
+        return cold_start(n, chains, seed)
+
+    z = model.over_draws("unconstrain", 1, data)(values)
+    x = coordinates_of({name: array[None] for name, array in z.items()})
+    if not np.isfinite(x).all():
+        return cold_start(n, chains, seed)
+    return warm_start(x, previous.attrs["step_size"], chains, seed)
+
+
+def _keys(n: int, seed: int) -> Any:
+    """Return n random keys."""
+    with own_settings():
+        return jax.random.split(jax.random.key(seed), n)
+
+
+def safe(name: str) -> str:
+    """Return the name of a variable in a DataTree, in which "/" separates groups."""
+    return name.replace("/", ".")
+
+
+def _without_padding(values: np.ndarray, site: Site, n_missions: int) -> np.ndarray:
+    """Drop the missions of the padding from values (chain, draw, ...)."""
+    if site.mission_axis is None:
+        return values
+    return values.take(range(n_missions), axis=2 + site.mission_axis)
+
+
+def _padded_values(posterior: xr.DataTree, sites: Mapping[str, Site]) -> dict[str, np.ndarray]:
+    """Return draws (draw, ...) of the variables, with any values for missions of the padding."""
+    draws = posterior["posterior"].to_dataset()
+    values = {}
+    for name, site in sites.items():
+        array = joined_draws(draws[safe(name)])
+        if site.mission_axis is not None:
+            axis = 1 + site.mission_axis
+            n_missing = site.shape[site.mission_axis] - array.shape[axis]
+            last = array.take([-1] * n_missing, axis=axis)
+            array = np.concatenate([array, last], axis=axis)
+        values[name] = array
+    return values
+
+
+def _form_of(found: Found, n_missions: int, n_bounds: int) -> tuple[StateSpace, Inputs]:
+    """Return the form (draw, group, member) and the inputs without padding."""
+    fields = [None if value is None else value[:, 0] for value in found.space]
+    inputs = [value[:, :n_missions, :n_bounds] for value in found.inputs]
+    return StateSpace(*fields), Inputs(*inputs)
+
+
+def _drawn_trust(
+    space: StateSpace, inputs: Inputs, observations: Observations, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw trust (draw, mission, bound, robot) given the rates of all missions."""
+    drift = np.asarray(inputs.drift)
+    n_draws, n_missions, n_bounds, n_groups, n = drift.shape
+    offset = np.broadcast_to(inputs.offset, drift.shape)
+    trust = np.empty((n_draws, n_missions, n_bounds, n_groups * n))
+    for j in range(n_missions):
+        rates = observations.contact_rate[j].reshape(n_bounds, n_groups, n)
+        of_bounds = [Inputs(drift[:, j, k], offset[:, j, k]) for k in range(n_bounds)]
+        drawn = kalman.draw_trust(space, of_bounds, rates, n_groups, rng)
+        trust[:, j] = drawn.reshape(n_draws, n_bounds, -1)
+    return trust
+
+
+def _replicated(
+    space: StateSpace, inputs: Inputs, observations: Observations, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw replicated rates (draw, mission, bound, robot)."""
+    drift = np.asarray(inputs.drift)
+    n_draws, n_missions, n_bounds, n_groups, n = drift.shape
+    offset = np.broadcast_to(inputs.offset, drift.shape)
+    family = FAMILIES["gaussian"]
+    rates = np.empty((n_draws, n_missions, n_bounds, n_groups * n))
+    for j in range(n_missions):
+        of_bounds = [Inputs(drift[:, j, k], offset[:, j, k]) for k in range(n_bounds)]
+        ticks = observations.n_ticks[j].reshape(n_bounds, n_groups, n)
+        begin = kalman.initial(space, n_groups)
+        drawn = kalman.forecast(space, begin, of_bounds, ticks, family, rng)
+        rates[:, j] = np.stack([of_robots for _, of_robots in drawn], axis=1)
+    return rates
+
+
+def _prior_predictive(
+    model: FunctionModel, data: Data, observations: Observations, seed: int
+) -> np.ndarray:
+    """Draw rates (chain, draw, mission, bound, robot) of the missions from the prior."""
+    keys = _keys(N_PRIOR, seed + 1)
+    values = model.over_draws("prior", 1, data)(keys)
+    found: Found = model.over_draws("evaluate", 2, data)(values, keys)
+    n_missions, n_bounds = observations.contact_rate.shape[:2]
+    space, inputs = _form_of(found, n_missions, n_bounds)
+    rng = stream(seed, "prior predictive")
+    return _replicated(space, inputs, observations, rng)[None]
+
+
+def _tree(
+    model: FunctionModel,
+    variables: Mapping[str, np.ndarray],
+    sites: Mapping[str, Site],
+    stats: Mapping[str, np.ndarray],
+    missions: Sequence[Mission],
+    data: Data,
+    seed: int,
+) -> xr.DataTree:
+    """Build a DataTree from draws, statistics, prior draws and the data."""
+    sizes = _sizes_of_axes(missions)
+    dims = {}
+    for name, site in sites.items():
+        shape = variables[name].shape[2:]
+        dims[safe(name)] = tuple(
+            dim if sizes.get(dim, n) == n else f"{safe(name)}_{dim}"
+            for dim, n in zip(site.dims, shape, strict=True)
+        )
+
+    prior = model.over_draws("prior", 1, data)(_keys(N_PRIOR, seed + 2))
+    prior = {
+        name: _without_padding(prior[name][None], site, len(missions))
+        for name, site in sites.items()
+    }
+    groups = {
+        "posterior": {safe(name): values for name, values in variables.items()},
+        "sample_stats": dict(stats),
+        "prior": {safe(name): values for name, values in prior.items()},
+    }
+    labels = {
+        dim: np.arange(variables[name].shape[2 + axis])
+        for name in sites
+        for axis, dim in enumerate(dims[safe(name)])
+        if dim not in sizes
+    }
+    tree = to_datatree(groups, missions, dims, labels=labels)
+    common = [name for name, site in sites.items() if site.mission_axis is None]
+    tree["posterior"].attrs["common"] = json.dumps(common)
+    return tree
+
+
+def _sizes_of_axes(missions: Sequence[Mission]) -> dict[str, int]:
+    """Return the lengths of the axes that posteriors of all models have."""
+    n_robots = len(missions[0].robots)
+    return {
+        "mission": len(missions),
+        "bound": max(len(mission.bounds) for mission in missions),
+        "robot": n_robots,
+        "robot_": n_robots,
+        "feature": len(missions[0].features),
+    }

@@ -1,0 +1,483 @@
+"""A NumPyro function as a trust model: its inputs, its sites, and what identifies it in files."""
+
+import ast
+import functools
+import hashlib
+import inspect
+import json
+import pickle
+import textwrap
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro import handlers
+from numpyro.distributions import biject_to
+from numpyro.infer.util import constrain_fn, potential_energy
+
+from trustbo.display import joined
+from trustbo.errors import TrustboError
+from trustbo.inference.functions.data import NAMES, RATES, Data
+from trustbo.models.backend import own_settings
+from trustbo.models.contact_rate import ContactRate
+from trustbo.models.model import TrustModel
+from trustbo.models.record import model_to_record
+from trustbo.statespace import Inputs, StateSpace
+
+KIND = "function"
+"""The entry `class` in the record of a model that is a function."""
+_HOW = (
+    'End it with numpyro.sample("contact_rate", tb.models.ContactRate(drift, beta0, delta_w, '
+    "delta_v), obs=contact_rate)."
+)
+_MOST_KNOWN = 64
+"""Number of functions that are remembered, with what was compiled for them."""
+_HASH_LENGTH = 16
+"""Number of hexadecimal digits of a hash."""
+
+
+class Site(NamedTuple):
+    """Latent variable of a function."""
+
+    dims: tuple[str, ...]
+    """Names of its axes: those of its plates, and `name_dim_0` and so on for others."""
+    mission_axis: int | None
+    """Axis that runs over missions; None if the variable is common to all missions."""
+    shape: tuple[int, ...]
+    n_free: int
+    """Number of its coordinates in unconstrained space."""
+
+
+class Found(NamedTuple):
+    """What a function computes for one draw of its variables."""
+
+    space: StateSpace
+    inputs: Inputs
+    log_prior: dict[str, Any]
+    """Log prior density of each variable."""
+    log_likelihood: Any
+    """Log density of each mission's rates, or log probability of its counts, shape (mission,)."""
+    of_counts: Any
+    """Whether `log_likelihood` is of tick counts if every rate has one."""
+    deterministic: dict[str, Any]
+
+
+class FunctionModel:
+    """A NumPyro function `model(awareness, contact_rate=None, ...)` as a trust model.
+
+    The distribution at its site `contact_rate` is the state space.
+
+    Attributes:
+        function: The function.
+        inputs: Names of the inputs that it takes; see `data.NAMES`.
+        compiled: Methods that were compiled for draws, by name.
+        sampler: `nuts.Sampler` of the function, once there is one.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        """Read the names of the function's parameters.
+
+        Raises:
+            TrustboError: If a parameter is not an input and has no default, or `awareness` or
+                `contact_rate` is not among the parameters.
+        """
+        self.function = function
+        self.name = getattr(function, "__name__", type(function).__name__)
+        self.inputs = _inputs_of(function, self.name)
+        self.fingerprint = fingerprint(function)
+        self.compiled: dict[str, Callable[..., Any]] = {}
+        self.sampler: Any = None
+
+    @property
+    def family(self) -> str:
+        """Name of the observation family of the rates."""
+        return "gaussian"
+
+    @property
+    def needs_observations(self) -> bool:
+        """Whether the function takes all data as one object, which cannot be compiled once."""
+        return "observations" in self.inputs
+
+    def __repr__(self) -> str:
+        return f"FunctionModel({self.in_short()})"
+
+    def in_short(self) -> str:
+        """Return the name of the function."""
+        return f"the function {self.name}"
+
+    def record(self) -> dict[str, Any]:
+        """Return the name and a hash of the function, for files."""
+        return {"class": KIND, "name": self.name, "sha256": self.fingerprint}
+
+    @cached_property
+    def text(self) -> str:
+        """The record as text, the attribute `model_record` of a posterior."""
+        return json.dumps(self.record())
+
+    def call(self, data: Data) -> None:
+        """Run the function on the inputs that it takes."""
+        self.function(**{name: data[name] for name in self.inputs})
+
+    def sites(self, data: Data) -> dict[str, Site]:
+        """Return the latent variables of the function by name, without computing anything.
+
+        Raises:
+            TrustboError: If the function fails, or has no site `contact_rate` with a `ContactRate`
+                of the shape of the missions, or a variable is discrete, or there is none.
+        """
+        trace: dict[str, Any] = {}
+
+        def run(key: jax.Array, arrays: dict[str, Any]) -> dict[str, Any]:
+            found = handlers.trace(handlers.seed(self.call, key)).get_trace({**data, **arrays})
+            trace.update(found)
+            self._require_rates(found, data)
+            return {
+                name: biject_to(found[name]["fn"].support).inv(found[name]["value"])
+                for name in _latent(found)
+            }
+
+        with own_settings(), _explained(self):
+            arrays = {name: values for name, values in data.items() if name != "observations"}
+            if self.needs_observations:  # its arrays must not be abstract
+                arrays = {}
+            free = jax.eval_shape(run, jax.random.key(0), arrays)
+
+        if not free:
+            raise TrustboError(f"{self.in_short()} has no latent variable to learn; sample one.")
+
+        plates = {frame.name for frame in trace[RATES]["cond_indep_stack"]}
+        return {name: _site(trace[name], free[name], plates) for name in free}
+
+    def _require_rates(self, trace: Mapping[str, Any], data: Data) -> None:
+        """Raise TrustboError unless the site `contact_rate` is the state space of the missions."""
+        site = trace.get(RATES)
+        if site is None or site["type"] != "sample":
+            names = [f"{name!r}" for name, one in trace.items() if one["type"] == "sample"]
+            sites = f"only {joined(names)}" if names else "no site at all"
+            raise TrustboError(f"{self.in_short()} has no site 'contact_rate', {sites}. {_HOW}")
+
+        rates = site["fn"]
+        if not isinstance(rates, ContactRate):
+            raise TrustboError(
+                f"the site 'contact_rate' of {self.in_short()} has the distribution "
+                f"{type(rates).__name__}; it must be tb.models.ContactRate. {_HOW}"
+            )
+        if not site["is_observed"]:
+            raise TrustboError(
+                f"the site 'contact_rate' of {self.in_short()} is not observed; pass "
+                "obs=contact_rate."
+            )
+
+        shape = np.shape(data[RATES])
+        given = (*rates.batch_shape, *rates.event_shape)
+        if given != shape:
+            raise TrustboError(
+                f"the drift of {self.in_short()} must have the shape (mission, bound, robot) = "
+                f"{shape}, as awareness is (mission, bound, robot, feature) = "
+                f"{np.shape(data['awareness'])}; got {given}."
+            )
+
+        for name, one in trace.items():
+            free = one["type"] == "sample" and not one["is_observed"]
+            if free and one["fn"].support.is_discrete:
+                raise TrustboError(
+                    f"the site {name!r} of {self.in_short()} is discrete, and NUTS samples "
+                    "continuous variables only; sum over its values."
+                )
+
+    # --- functions that are compiled once for each shape of their arguments ---
+
+    def potential(self, z: Mapping[str, Any], data: Data) -> Any:
+        """Compute the negative log density at values z of unconstrained space."""
+        return potential_energy(handlers.seed(self.call, 0), (data,), {}, dict(z))
+
+    def constrain(self, z: Mapping[str, Any], data: Data) -> dict[str, Any]:
+        """Convert values of unconstrained space to values of the variables."""
+        return constrain_fn(handlers.seed(self.call, 0), (data,), {}, dict(z))
+
+    def unconstrain(self, values: Mapping[str, Any], data: Data) -> dict[str, Any]:
+        """Convert values of the variables to values of unconstrained space."""
+        trace = self._trace(values, jax.random.key(0), data)
+        return {name: biject_to(trace[name]["fn"].support).inv(v) for name, v in values.items()}
+
+    def prior(self, key: jax.Array, data: Data) -> dict[str, Any]:
+        """Draw the variables from the prior."""
+        trace = self._trace({}, key, data)
+        return {name: trace[name]["value"] for name in _latent(trace)}
+
+    def evaluate(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> Found:
+        """Run the function with given values of its variables; others are drawn from the prior."""
+        trace = self._trace(values, key, data)
+        rates: Any = trace[RATES]["fn"]
+        return Found(
+            space=rates.space,
+            inputs=rates.inputs,
+            log_prior={
+                name: jnp.sum(trace[name]["fn"].log_prob(trace[name]["value"]))
+                for name in _latent(trace)
+            },
+            log_likelihood=rates.log_prob(trace[RATES]["value"]),
+            of_counts=jnp.asarray(rates.n_ticks is not None),
+            deterministic={
+                name: site["value"]
+                for name, site in trace.items()
+                if site["type"] == "deterministic"
+            },
+        )
+
+    def form(
+        self, values: Mapping[str, Any], key: jax.Array, data: Data
+    ) -> tuple[StateSpace, Inputs]:
+        """Return the state space and the inputs for given values of the variables."""
+        rates: Any = self._trace(values, key, data)[RATES]["fn"]
+        return rates.space, rates.inputs
+
+    def _trace(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> dict[str, Any]:
+        """Run the function with given values of some sites."""
+        given = handlers.substitute(handlers.seed(self.call, key), dict(values))
+        return handlers.trace(given).get_trace(data)
+
+    def over_draws(self, method: str, n_draw_axes: int, data: Data) -> Callable[..., Any]:
+        """Return a method whose first arguments have an axis (draw,), compiled for these data.
+
+        Args:
+            method: Name of a method whose last argument is `data`.
+            n_draw_axes: Number of arguments with an axis (draw,).
+            data: Inputs.
+        """
+        axes = (*(0,) * n_draw_axes, None)
+        if self.needs_observations:
+            of_data = getattr(self, method)
+            mapped = jax.jit(jax.vmap(lambda *draws: of_data(*draws, data)))
+            return lambda *draws: self._called(mapped, draws)
+
+        if method not in self.compiled:
+            self.compiled[method] = jax.jit(jax.vmap(getattr(self, method), in_axes=axes))
+        mapped = self.compiled[method]
+        arrays = {name: jnp.asarray(data[name]) for name in self.inputs}
+        arrays[RATES] = jnp.asarray(data[RATES])
+        return lambda *draws: self._called(mapped, (*draws, arrays))
+
+    def _called(self, compiled: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+        """Call a compiled function with the settings and messages of this module."""
+        with own_settings(), _explained(self):
+            return jax.tree.map(np.asarray, compiled(*arguments))
+
+
+class _explained:  # noqa: N801
+    """Context in which an error in a user's function says which function failed."""
+
+    def __init__(self, model: FunctionModel) -> None:
+        self.model = model
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, Exception) and not isinstance(error, TrustboError):
+            text = str(error).strip().splitlines() or [""]
+            raise TrustboError(
+                f"{self.model.in_short()} failed with {type(error).__name__}: {text[0]}"
+            ) from error
+
+
+_KNOWN: OrderedDict[str, FunctionModel] = OrderedDict()
+
+
+def as_model(function: Callable[..., Any] | FunctionModel) -> FunctionModel:
+    """Return the model of a function, the same one for the same function.
+
+    Raises TrustboError if the function cannot be a model; see `FunctionModel`.
+    """
+    if isinstance(function, FunctionModel):
+        return function
+
+    model = FunctionModel(function)
+    known = _KNOWN.get(model.fingerprint)
+    if known is not None and known.function == function:
+        model = known
+
+    _KNOWN[model.fingerprint] = model
+    _KNOWN.move_to_end(model.fingerprint)
+    if len(_KNOWN) > _MOST_KNOWN:
+        _KNOWN.popitem(last=False)
+    return model
+
+
+def model_of_record(
+    record: Mapping[str, Any], given: Callable[..., Any] | FunctionModel | None = None
+) -> FunctionModel:
+    """Return the model with a record, which must be given or have been used in this process.
+
+    Raises:
+        TrustboError: If the function is not known, or another one is given.
+    """
+    if given is not None:
+        model = as_model(given)
+        if model.record() != dict(record):
+            raise TrustboError(
+                f"the posterior is of the function {record['name']!r} with the hash "
+                f"{record['sha256']}, not of {model.name!r} with the hash {model.fingerprint}. "
+                "Give the same function, with the same constants, or fit again."
+            )
+        return model
+
+    model = _KNOWN.get(record["sha256"])
+    if model is None:
+        raise TrustboError(
+            f"the posterior is of the NumPyro function {record['name']!r}, which is not stored; "
+            "give it with model=."
+        )
+    return model
+
+
+def is_of_function(record: Mapping[str, Any]) -> bool:
+    """Return whether a record is of a model that is a function."""
+    return record["class"] == KIND
+
+
+def _inputs_of(function: Callable[..., Any], name: str) -> tuple[str, ...]:
+    """Return the names of a function's inputs; raises TrustboError if they are wrong."""
+    parameters = inspect.signature(function).parameters
+    takes = tuple(one for one in parameters if one in NAMES)
+    if "observations" not in takes:
+        for needed in ("awareness", RATES):
+            if needed not in takes:
+                raise TrustboError(
+                    f"the function {name} must have the parameters awareness and contact_rate; "
+                    f"got {name}({', '.join(parameters)}). Other inputs are "
+                    f"{joined([one for one in NAMES if one not in ('awareness', RATES)])}."
+                )
+
+    unknown = [
+        one.name
+        for one in parameters.values()
+        if one.name not in NAMES
+        and one.default is one.empty
+        and one.kind not in (one.VAR_POSITIONAL, one.VAR_KEYWORD)
+    ]
+    if unknown:
+        raise TrustboError(
+            f"the parameter {unknown[0]!r} of the function {name} is not an input of a model; the "
+            f"inputs are {joined(list(NAMES))}. Give it a default, or use functools.partial."
+        )
+    return takes
+
+
+def _latent(trace: Mapping[str, Any]) -> list[str]:
+    """Return the names of the latent variables in a trace."""
+    return [
+        name for name, site in trace.items() if site["type"] == "sample" and not site["is_observed"]
+    ]
+
+
+def _site(site: Mapping[str, Any], free: Any, plates: set[str]) -> Site:
+    """Describe a latent variable; `plates` are those of the contact rates."""
+    shape = np.shape(site["value"])
+    n_event = len(site["fn"].event_shape)
+    n_batch = len(shape) - n_event
+    dims = [f"{site['name']}_dim_{i}" for i in range(len(shape))]
+    mission_axis = None
+
+    for frame in site["cond_indep_stack"]:
+        axis = n_batch + frame.dim  # `dim` counts from the last axis of the batch
+        if not 0 <= axis < n_batch or shape[axis] != frame.size:
+            continue
+        dims[axis] = "mission" if frame.name in plates else frame.name
+        if frame.name in plates:
+            mission_axis = axis
+
+    return Site(tuple(dims), mission_axis, shape, int(np.prod(np.shape(free))))
+
+
+# --- what identifies a function ---
+
+
+def fingerprint(function: Callable[..., Any]) -> str:
+    """Return a hash of a function: its code, without comments, and the values that it refers to.
+
+    Values are defaults, variables of enclosing functions, and global functions and constants of
+    the same module. Functions of other modules are identified by their names.
+    """
+    parts: list[str] = []
+    _describe(function, parts, set())
+    text = "\n".join(parts)
+    return hashlib.sha256(text.encode()).hexdigest()[:_HASH_LENGTH]
+
+
+def _describe(value: Any, parts: list[str], seen: set[int]) -> None:
+    """Add texts to `parts` that tell a value from others."""
+    if id(value) in seen:
+        return
+    seen.add(id(value))
+
+    if isinstance(value, TrustModel):
+        parts.append(json.dumps(model_to_record(value), sort_keys=True))
+    elif inspect.ismethod(value):
+        _describe(value.__self__, parts, seen)
+        _describe(value.__func__, parts, seen)
+    elif inspect.isfunction(value):
+        _describe_function(value, parts, seen)
+    elif isinstance(value, functools.partial):
+        for one in (value.func, *value.args, *value.keywords.items()):
+            _describe(one, parts, seen)
+    elif isinstance(value, np.ndarray | jax.Array):
+        array = np.asarray(value)
+        parts.append(f"{array.dtype} {array.shape} {hashlib.sha256(array.tobytes()).hexdigest()}")
+    else:
+        parts.append(_text_of(value))
+
+
+def _describe_function(function: Callable[..., Any], parts: list[str], seen: set[int]) -> None:
+    """Describe the code of a function and the values that it refers to."""
+    parts.append(_code_of(function))
+    defaults = function.__defaults__ or ()
+    by_keyword = function.__kwdefaults__ or {}
+    enclosed = [_content(cell) for cell in function.__closure__ or ()]
+    for one in (*defaults, *by_keyword.values(), *enclosed):
+        _describe(one, parts, seen)
+    for name in sorted(function.__code__.co_names):
+        _describe_global(function, name, parts, seen)
+
+
+def _describe_global(
+    function: Callable[..., Any], name: str, parts: list[str], seen: set[int]
+) -> None:
+    """Describe a global function or constant of the same module that a function refers to."""
+    value = function.__globals__.get(name)
+    is_own = getattr(value, "__module__", None) == function.__module__
+    if inspect.isfunction(value) and is_own:
+        _describe(value, parts, seen)
+    elif isinstance(value, bool | int | float | str | tuple | np.ndarray | jax.Array):
+        parts.append(name)
+        _describe(value, parts, seen)
+
+
+def _code_of(function: Callable[..., Any]) -> str:
+    """Return the code of a function without comments, or its byte code if there is no source."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    except (OSError, TypeError, SyntaxError):
+        code = function.__code__
+        return f"{code.co_code.hex()} {code.co_consts!r} {code.co_names!r}"
+    return ast.unparse(tree)
+
+
+def _content(cell: Any) -> Any:
+    """Return the value of a variable of an enclosing function, or None if it is not set."""
+    try:
+        return cell.cell_contents
+    except ValueError:
+        return None
+
+
+def _text_of(value: Any) -> str:
+    """Return a text that tells a value from others, the same in other processes."""
+    try:
+        return hashlib.sha256(pickle.dumps(value, protocol=4)).hexdigest()
+    except Exception:  # values that cannot be pickled are told apart by their kind only
+        return f"{type(value).__module__}.{type(value).__qualname__}"

@@ -1,0 +1,231 @@
+"""Sampling of a model that is a NumPyro function with NUTS, compiled once for each shape of data.
+
+The data, the starts of the chains, the step size and the mass matrix are arguments of the compiled
+function, so a campaign that fits after each mission compiles it only when the padded data grow.
+Chains start from draws of the previous posterior, if there is one.
+"""
+
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from numpyro.infer.hmc import hmc
+
+from trustbo.display import slow_bar
+from trustbo.errors import TrustboError
+from trustbo.inference.functions.data import Data
+from trustbo.inference.functions.function import FunctionModel, Site
+from trustbo.models.backend import own_settings
+
+_CANDIDATES = 16
+"""Points from which the start of a chain is chosen, that of the largest density."""
+_RADIUS = 2.0
+"""Candidates are uniform in (-2, 2) in unconstrained space, as in Stan and NumPyro."""
+_FIRST_STEP = 0.1
+"""Step size at which warm-up starts without a previous posterior."""
+_MOST_DENSE = 50
+"""Most coordinates for which the mass matrix is dense."""
+_RIDGE = 1e-3
+"""Share of the variances that is added to the covariance of a previous posterior."""
+_FIELDS = ("num_steps", "diverging", "accept_prob", "energy", "potential_energy")
+
+
+class Start(NamedTuple):
+    """Where the chains start."""
+
+    x: np.ndarray
+    """Candidates, shape (chain, candidate, coordinate)."""
+    step_size: float
+    inverse_mass: np.ndarray
+    """Inverse mass matrix (coordinate, coordinate), or its diagonal (coordinate,)."""
+
+
+class Samples(NamedTuple):
+    """Draws of a chain in unconstrained space, and statistics of the sampler."""
+
+    z: dict[str, np.ndarray]
+    """Values (chain, draw, ...) of the variables in unconstrained space."""
+    fields: dict[str, np.ndarray]
+    """Statistics (chain, draw) by NumPyro's names."""
+    step_size: float
+    """Mean step size after warm-up."""
+
+
+class Sampler:
+    """NUTS for a function, compiled for each number of draws and each shape of data."""
+
+    def __init__(self, model: FunctionModel) -> None:
+        self.model = model
+        self._compiled: dict[Any, Callable[..., Any]] = {}
+
+    def sample(
+        self,
+        data: Data,
+        sites: Mapping[str, Site],
+        start: Start,
+        warmup: int,
+        draws: int,
+        *,
+        accept: float,
+        seed: int,
+        progress: bool,
+    ) -> Samples:
+        """Sample from the posterior.
+
+        Args:
+            data: Padded data.
+            sites: Variables of the function for these data.
+            start: Where the chains start, how large steps are at first, and the mass matrix.
+            warmup: Number of draws per chain that tune the kernel and are discarded.
+            draws: Number of draws per chain.
+            accept: Target of the acceptance probability.
+            seed: Random seed.
+            progress: Whether to show the seconds after 5 seconds.
+
+        Raises:
+            TrustboError: If no candidate has a finite density.
+        """
+        with own_settings(), slow_bar("NUTS", " s", progress) as bar, ticking(bar):
+            free = free_shapes(self.model, sites, data)
+            unravel = ravel_pytree(free)[1]
+            run = self._run_of(free, unravel, warmup, draws, data)
+
+            arrays = {}
+            if not self.model.needs_observations:
+                arrays = {name: jnp.asarray(data[name]) for name in self.model.inputs}
+            keys = jax.random.split(jax.random.key(seed), len(start.x))
+            found = run(keys, start.x, start.step_size, start.inverse_mass, accept, arrays)
+            x, fields, step_size = jax.tree.map(np.asarray, found)
+            z = jax.tree.map(np.asarray, jax.vmap(jax.vmap(unravel))(x))
+
+        if not np.isfinite(fields["potential_energy"]).all():
+            raise TrustboError(
+                f"{self.model.in_short()} has no finite density at the starts of the chains. Check "
+                "that delta_w and delta_v are positive and that the drift is finite."
+            )
+        return Samples(z, fields, float(step_size.mean()))
+
+    def _run_of(
+        self,
+        free: Mapping[str, Any],
+        unravel: Callable[..., Any],
+        warmup: int,
+        draws: int,
+        data: Data,
+    ) -> Callable[..., Any]:
+        """Return the compiled function that runs the chains."""
+        shapes = tuple((name, np.shape(values)) for name, values in free.items())
+        fixed = id(data["observations"]) if self.model.needs_observations else None
+        known = (shapes, warmup, draws, fixed)
+        if known in self._compiled:
+            return self._compiled[known]
+
+        n = sum(int(np.prod(shape)) for _, shape in shapes)
+
+        def potential_of(arrays: Data) -> Callable[[Any], Any]:
+            given = data if self.model.needs_observations else arrays
+            return lambda x: self.model.potential(unravel(x), given)
+
+        def chain(
+            key: Any, candidates: Any, step_size: Any, mass: Any, accept: Any, arrays: Any
+        ) -> Any:
+            density = lax.map(potential_of(arrays), candidates)
+            chosen = jnp.argmin(jnp.where(jnp.isfinite(density), density, jnp.inf))
+
+            begin, move = hmc(potential_fn_gen=potential_of, algo="NUTS")
+            state = begin(
+                candidates[chosen],
+                num_warmup=warmup,
+                step_size=step_size,
+                inverse_mass_matrix=mass,
+                dense_mass=n <= _MOST_DENSE,
+                target_accept_prob=accept,
+                model_args=(arrays,),
+                rng_key=key,
+            )
+
+            def one(state: Any, _: None) -> Any:
+                state = move(state, (arrays,), {})
+                return state, (state.z, {name: getattr(state, name) for name in _FIELDS})
+
+            last, (x, fields) = lax.scan(one, state, None, length=warmup + draws)
+            kept = {name: values[warmup:] for name, values in fields.items()}
+            return x[warmup:], kept, last.adapt_state.step_size
+
+        run = jax.jit(jax.vmap(chain, in_axes=(0, 0, None, None, None, None)))
+        self._compiled[known] = run
+        return run
+
+
+@contextmanager
+def ticking(bar: Any) -> Iterator[None]:
+    """Count seconds in a progress bar while the block runs, as compiled code reports nothing."""
+    done = threading.Event()
+
+    def tick() -> None:
+        while not done.wait(1.0):
+            bar.update(1)
+
+    thread = threading.Thread(target=tick, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+def free_shapes(model: FunctionModel, sites: Mapping[str, Site], data: Data) -> dict[str, Any]:
+    """Return zeros of the shape of each variable in unconstrained space."""
+
+    def run(key: jax.Array) -> dict[str, Any]:
+        values = model.prior(key, data)
+        return model.unconstrain({name: values[name] for name in sites}, data)
+
+    shapes = jax.eval_shape(run, jax.random.key(0))
+    return {name: np.zeros(shapes[name].shape) for name in sorted(sites)}
+
+
+def coordinates_of(z: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return values (chain, draw, ...) in unconstrained space as an array (point, coordinate)."""
+    parts = [np.reshape(z[name], (z[name].shape[0] * z[name].shape[1], -1)) for name in sorted(z)]
+    return np.concatenate(parts, axis=1)
+
+
+def joined_samples(runs: Sequence[Samples], draws: int) -> Samples:
+    """Join the draws of runs, and keep `draws` of them per chain, evenly spaced."""
+
+    def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+        every = np.concatenate(parts, axis=1)
+        return every[:, np.linspace(0, every.shape[1] - 1, draws).astype(int)]
+
+    first = runs[0]
+    z = {name: joined([run.z[name] for run in runs]) for name in first.z}
+    fields = {name: joined([run.fields[name] for run in runs]) for name in first.fields}
+    return Samples(z, fields, runs[-1].step_size)
+
+
+def cold_start(n: int, chains: int, seed: int) -> Start:
+    """Return a start without a previous posterior, for n coordinates."""
+    rng = np.random.default_rng([seed, 1])
+    x = rng.uniform(-_RADIUS, _RADIUS, (chains, _CANDIDATES, n))
+    mass = np.eye(n) if n <= _MOST_DENSE else np.ones(n)
+    return Start(x, _FIRST_STEP, mass)
+
+
+def warm_start(x: np.ndarray, step_size: float, chains: int, seed: int) -> Start:
+    """Return a start from draws x (draw, coordinate) of a previous posterior."""
+    rng = np.random.default_rng([seed, 1])
+    chosen = x[rng.integers(len(x), size=(chains, _CANDIDATES))]
+
+    variance = x.var(0)
+    mass = variance
+    if x.shape[1] <= _MOST_DENSE:
+        mass = np.cov(x.T).reshape(x.shape[1], -1) + _RIDGE * np.diag(variance)
+    return Start(chosen, step_size, mass)

@@ -1,0 +1,387 @@
+"""Models as campaigns use them: what is learned from missions, and draws for planning.
+
+A model is a `TrustModel` or a NumPyro function. Both become a `Learner`, so that only this module
+distinguishes them.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Protocol
+
+import xarray as xr
+
+from trustbo.data import Mission
+from trustbo.errors import Renamed, TrustboError, require_kind
+from trustbo.inference.draws import (
+    expected_and_drawn_of_model,
+    missions_of,
+    params_of_model,
+    prior_mean,
+    read_posterior,
+    require_posterior,
+    sample_prior,
+)
+from trustbo.inference.fit import SAMPLERS, fit
+from trustbo.inference.functions.draws import FunctionDraws
+from trustbo.inference.functions.fit import (
+    draws_of_function,
+    prior_draws_of_function,
+    require_plannable,
+    with_latent_of_function,
+)
+from trustbo.inference.functions.function import (
+    FunctionModel,
+    as_model,
+    is_of_function,
+    model_of_record,
+)
+from trustbo.inference.tree import parameters_alone, with_latent
+from trustbo.models.default import default_model
+from trustbo.models.draws import Draws
+from trustbo.models.effects.place import PlaceEffect
+from trustbo.models.model import TrustModel
+from trustbo.models.people import HumanTrust
+from trustbo.models.record import model_from_record, model_to_record
+from trustbo.parallel import computing
+from trustbo.workspace import Workspace
+
+Model = TrustModel | Callable[..., Any]
+"""A trust model: an object of a model class, or a NumPyro function."""
+
+_N_DRAWS = 1000
+"""Posterior draws of the parameters per chain."""
+_N_PLACE_DRAWS = 250
+"""The same with place effects, whose draws are large, from the importance sampler."""
+_N_MEAN = 500
+"""Prior draws of a function that are averaged for the first plan."""
+
+
+class Learner(Protocol):
+    """A model that learns from missions, and whose draws make plans."""
+
+    samplers: ClassVar[tuple[str, ...]]
+    """Names of the samplers of the posterior, the default first."""
+    model: Any
+    """The model."""
+
+    @property
+    def family(self) -> str:
+        """Name of the observation family of the rates."""
+        ...
+
+    def in_short(self) -> str:
+        """Describe the model in a few words."""
+        ...
+
+    def record(self) -> dict[str, Any]:
+        """Return what identifies the model in files, as plain values."""
+        ...
+
+    def fit(
+        self,
+        missions: Sequence[Mission],
+        *,
+        workspace: Workspace,
+        sampler: str,
+        seed: int,
+        progress: bool,
+        start: xr.DataTree | None,
+        **options: Any,
+    ) -> xr.DataTree:
+        """Fit the parameters to missions, without the groups of `add_latent`; see `fit`."""
+        ...
+
+    def add_latent(self, posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
+        """Add latent trust, log-likelihoods and predictions to a posterior."""
+        ...
+
+    def draws(
+        self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False
+    ) -> Draws:
+        """Return all draws of a posterior; see `params_of`."""
+        ...
+
+    def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
+        """Draw parameters from the prior, with a leading axis (draw,)."""
+        ...
+
+    def prior_mean(self, workspace: Workspace) -> Draws:
+        """Return the prior mean, with a leading axis (draw,) of length 1."""
+        ...
+
+
+class ClassLearner:
+    """Learner of a model class; the model is None if it is custom and was read from files."""
+
+    samplers: ClassVar[tuple[str, ...]] = SAMPLERS
+
+    def __init__(self, model: TrustModel | None) -> None:
+        self.model = model
+
+    @property
+    def _known(self) -> TrustModel:
+        if self.model is None:
+            raise TrustboError("the model is custom and not stored; give it with model=.")
+        return self.model
+
+    @property
+    def family(self) -> str:
+        """See `Learner.family`."""
+        return self._known.family
+
+    def in_short(self) -> str:
+        """See `Learner.in_short`."""
+        return self._known.in_short()
+
+    def record(self) -> dict[str, Any]:
+        """See `Learner.record`."""
+        return model_to_record(self._known)
+
+    def fit(
+        self,
+        missions: Sequence[Mission],
+        *,
+        workspace: Workspace,
+        sampler: str,
+        seed: int,
+        progress: bool,
+        start: xr.DataTree | None,
+        **options: Any,
+    ) -> xr.DataTree:
+        """See `Learner.fit`."""
+        # Importance draws are independent, so fewer suffice than of a chain.
+        has_places = any(isinstance(effect, PlaceEffect) for effect in self._known.effects)
+        few = sampler == "importance" and has_places
+        options = {"draws": _N_PLACE_DRAWS if few else _N_DRAWS} | options
+        tree = fit(
+            missions,
+            self._known,
+            sampler=sampler,
+            workspace=workspace,
+            seed=seed,
+            progress=progress,
+            latent=False,
+            start=start,
+            **options,
+        )
+        return parameters_alone(tree)
+
+    def add_latent(self, posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
+        """See `Learner.add_latent`."""
+        # The group `log_prior` requires the model if its priors are not the defaults.
+        return add_latent(posterior, missions, model=self.model)
+
+    def draws(
+        self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False
+    ) -> Draws:
+        """See `Learner.draws`."""
+        return params_of_model(posterior, workspace, next_mission=next_mission)
+
+    def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
+        """See `Learner.prior_draws`."""
+        features = workspace.features
+        model = self._known.for_features(features)
+        n_robots = workspace.team.n_robots
+        return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots).flat()
+
+    def prior_mean(self, workspace: Workspace) -> Draws:
+        """See `Learner.prior_mean`."""
+        features = workspace.features
+        model = self._known.for_features(features)
+        return prior_mean(model, len(features), n_robots=workspace.team.n_robots).flat()
+
+
+class FunctionLearner:
+    """Learner of a NumPyro function."""
+
+    samplers: ClassVar[tuple[str, ...]] = ("nuts",)
+
+    def __init__(self, model: FunctionModel) -> None:
+        self.model = model
+
+    @property
+    def family(self) -> str:
+        """See `Learner.family`."""
+        return self.model.family
+
+    def in_short(self) -> str:
+        """See `Learner.in_short`."""
+        return self.model.in_short()
+
+    def record(self) -> dict[str, Any]:
+        """See `Learner.record`."""
+        return self.model.record()
+
+    def fit(
+        self,
+        missions: Sequence[Mission],
+        *,
+        workspace: Workspace,
+        sampler: str,
+        seed: int,
+        progress: bool,
+        start: xr.DataTree | None,
+        **options: Any,
+    ) -> xr.DataTree:
+        """See `Learner.fit`; the sampler is NUTS."""
+        tree = fit(
+            missions,
+            self.model.function,
+            workspace=workspace,
+            seed=seed,
+            progress=progress,
+            latent=False,
+            start=start,
+            **options,
+        )
+        return parameters_alone(tree)
+
+    def add_latent(self, posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
+        """See `Learner.add_latent`."""
+        return add_latent(posterior, missions, model=self.model.function)
+
+    def draws(
+        self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False
+    ) -> Draws:
+        """See `Learner.draws`; variables of one mission are always drawn for the next one."""
+        return draws_of_function(self.model, posterior, workspace)
+
+    def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> FunctionDraws:
+        """See `Learner.prior_draws`."""
+        return prior_draws_of_function(self.model, n_draws, seed, workspace)
+
+    def prior_mean(self, workspace: Workspace) -> Draws:
+        """See `Learner.prior_mean`."""
+        return self.prior_draws(_N_MEAN, 0, workspace).mean().flat()
+
+
+def learner_of(model: Model | FunctionModel | None, workspace: Workspace) -> Learner:
+    """Return the learner of a model, by default of the default model, for a workspace.
+
+    Raises:
+        TrustboError: If it is neither a trust model nor a NumPyro function, or it cannot plan.
+    """
+    if model is None:
+        return ClassLearner(default_model())
+    if isinstance(model, HumanTrust):
+        raise TrustboError("model: HumanTrust cannot plan paths; give PooledTrust() instead.")
+    if isinstance(model, TrustModel):
+        return ClassLearner(model)
+
+    is_function = callable(model) and not isinstance(model, type)
+    if not is_function and not isinstance(model, FunctionModel):
+        remedy = "give a trust model, such as PooledTrust(), or a NumPyro function"
+        require_kind("model", model, TrustModel, remedy)
+    function = as_model(model)
+    require_plannable(function, workspace)
+    return FunctionLearner(function)
+
+
+def learner_from_record(record: dict[str, Any], given: Model | None = None) -> Learner:
+    """Return the learner of a model with this record.
+
+    Raises:
+        TrustboError: If the model is custom and not given, or another one is given.
+    """
+    if is_of_function(record):
+        if isinstance(given, TrustModel):
+            raise TrustboError(f"the model is the function {record['name']!r}; got {given!r}.")
+        return FunctionLearner(model_of_record(record, given))
+    if given is not None:
+        require_kind("model", given, TrustModel, "give the model of the posterior")
+    return ClassLearner(model_from_record(record, given))  # pyright: ignore[reportArgumentType]
+
+
+def learner_of_posterior(posterior: xr.DataTree, model: Model | None = None) -> Learner:
+    """Return the learner of a posterior; a custom model is needed only for its prior."""
+    record = json.loads(posterior.attrs["model_record"])
+    if is_of_function(record):
+        return FunctionLearner(model_of_record(record, model))  # pyright: ignore[reportArgumentType]
+    return ClassLearner(model)  # pyright: ignore[reportArgumentType]
+
+
+@Renamed(day="next_mission")
+@computing()
+def params_of(
+    posterior: xr.DataTree,
+    workspace: Workspace | None = None,
+    *,
+    next_mission: bool = False,
+    model: Model | None = None,
+) -> Draws:
+    """Return all draws of a posterior as parameters, with chains joined in a leading axis (draw,).
+
+    Args:
+        posterior: DataTree from `fit`.
+        workspace: Workspace for planning; features and robots are reordered to match the workspace.
+        next_mission: Whether to draw the robot effects of the next mission, including their
+            persistent part, for bands and predictions. By default, expected effects are used, as
+            planning needs.
+        model: Model of the posterior; needed only for a NumPyro function that was not used before
+            in this process.
+
+    Returns:
+        `TrustParams`, `RobotParams` or `CoupledParams`, depending on the model. A pooled model with
+        robot effects gives `RobotParams` for the next mission, in which the line-of-sight weights
+        include each robot's persistent effect, decayed by one mission. A function gives
+        `FunctionDraws`.
+
+    Raises:
+        TrustboError: If the posterior is not from `fit`; a variable is missing or has NaN draws; or
+            features or robots differ from those of the workspace.
+    """
+    require_posterior("params_of", posterior)
+    learner = learner_of_posterior(posterior, model)
+    return learner.draws(posterior, workspace, next_mission=next_mission)
+
+
+@computing()
+def expected_and_drawn(
+    posterior: xr.DataTree, workspace: Workspace | None = None
+) -> tuple[Draws, Draws]:
+    """Return `params_of` without and with `next_mission`; the posterior is read once."""
+    require_posterior("params_of", posterior)
+    learner = learner_of_posterior(posterior)
+    if isinstance(learner, FunctionLearner):
+        draws = learner.draws(posterior, workspace)
+        return draws, draws
+    return expected_and_drawn_of_model(posterior, workspace)
+
+
+@computing()
+def add_latent(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission] | None = None,
+    *,
+    model: Model | None = None,
+    progress: bool = True,
+) -> xr.DataTree:
+    """Add latent trust, log-likelihoods and predictions to a posterior.
+
+    A campaign stores only the parameters of its posteriors because the other groups grow with the
+    number of missions. The other groups can be computed at any time with the same result.
+
+    Args:
+        posterior: DataTree from `fit`, or one of `Result.posteriors`.
+        missions: Fitted missions; needed if the posterior contains no data.
+        model: Model of the posterior; needed if the priors are custom, or if it is a NumPyro
+            function that was not used before in this process.
+        progress: Whether to show a progress bar after 5 seconds.
+
+    Returns:
+        The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive`,
+        `log_prior` and `log_likelihood`, or the unchanged posterior if `latent` already exists.
+
+    Raises:
+        TrustboError: If the posterior contains no data and no missions are given.
+    """
+    if "latent" in require_posterior("add_latent", posterior).children:
+        return posterior
+
+    missions = missions_of(posterior) if missions is None else missions
+    learner = learner_of_posterior(posterior, model)
+    if isinstance(learner, FunctionLearner):
+        return with_latent_of_function(posterior, missions, learner.model, progress=progress)
+
+    fitted, draws = read_posterior(posterior, missions, model=model)  # pyright: ignore[reportArgumentType]
+    return with_latent(posterior, missions, fitted, draws, progress=progress)
