@@ -48,7 +48,7 @@ _PRIOR_VARIANCE = 1.2
 """Variance of the other scores in the defensive proposal; a priori, it is 1."""
 
 
-class Draws(NamedTuple):
+class JointDraws(NamedTuple):
     """Draws of hyperparameters, coefficients and, unless rates are Gaussian, predictors."""
 
     theta: dict[str, np.ndarray]  # (draw, ...)
@@ -268,7 +268,7 @@ class Density:
 
     def draw_by_ep(
         self, z: np.ndarray, log_p: np.ndarray, rng: np.random.Generator, n_sweeps: int
-    ) -> tuple[Draws, np.ndarray]:
+    ) -> tuple[JointDraws, np.ndarray]:
         """Draw coefficients and linear predictors once at each of the equally weighted points.
 
         Args:
@@ -288,7 +288,7 @@ class Density:
             parts.append(ep.draw(joint, sites, rng))
 
         c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return Draws(theta, c, f), log_weight + self.scores.log_prior(z) - log_p
+        return JointDraws(theta, c, f), log_weight + self.scores.log_prior(z) - log_p
 
     def draw_coefficients(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
         """Draw the coefficients (point, column) once at each point given Gaussian rates."""

@@ -10,7 +10,7 @@ import xarray as xr
 
 from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError, require_count, require_kind, require_whole
-from trustbo.inference.density import Density, Draws
+from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.inference.variables import draws_of, prior_parameters
 from trustbo.models.effects.effect import Effect, Theta
@@ -263,7 +263,7 @@ def read_posterior(
     missions: Sequence[Mission] | None = None,
     *,
     model: TrustModel | None = None,
-) -> tuple[Density, Draws]:
+) -> tuple[Density, JointDraws]:
     """Rebuild the `Density` and the draws of a DataTree, with chains joined.
 
     Args:

@@ -20,7 +20,7 @@ from trustbo.errors import (
     require_kind,
     require_whole,
 )
-from trustbo.inference.density import SWEEPS, Coefficients, Density, Draws
+from trustbo.inference.density import SWEEPS, Coefficients, Density, JointDraws
 from trustbo.inference.importance import (
     MAX_KHAT,
     LogDensity,
@@ -232,7 +232,7 @@ def _fit_model(
 
 def by_importance(
     density: Density, n: int, seed: int, first: Student | None = None
-) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any]]:
+) -> tuple[JointDraws, dict[str, np.ndarray], dict[str, Any]]:
     """Draw n times by importance sampling; return draws, statistics (draw,) and a summary.
 
     `first` is the first proposal. By default, or if its weights are uneven, the first proposal is
@@ -261,7 +261,7 @@ def _exact_draws(
     n_sweeps: int,
     rng: np.random.Generator,
     first: Student | None,
-) -> tuple[Draws, np.ndarray, dict[str, Any]]:
+) -> tuple[JointDraws, np.ndarray, dict[str, Any]]:
     """Draw n times given Gaussian rates, for which the log density of scores is exact."""
     visited: list[Coefficients] = []
 
@@ -274,7 +274,7 @@ def _exact_draws(
     chosen = points.resample(n, rng)
 
     c = Coefficients.joined(visited).draw(chosen, rng)
-    drawn = Draws(density.theta(points.z[chosen]), c)
+    drawn = JointDraws(density.theta(points.z[chosen]), c)
 
     summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
     return drawn, points.log_p[chosen], summary | {"proposal": points.proposal.text}
@@ -287,7 +287,7 @@ def _ep_draws(
     n_sweeps: int,
     rng: np.random.Generator,
     first: Student | None,
-) -> tuple[Draws, np.ndarray, dict[str, Any]]:
+) -> tuple[JointDraws, np.ndarray, dict[str, Any]]:
     """Draw n times given other rates, and correct the density of scores by EP with weights."""
     points = _points(density, size, rng, first)
 

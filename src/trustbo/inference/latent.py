@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from trustbo.inference import ep
-from trustbo.inference.density import SWEEPS, Density, Draws, chunks
+from trustbo.inference.density import SWEEPS, Density, JointDraws, chunks
 from trustbo.inference.engine import expected, whiten
 from trustbo.inference.factor import cholesky
 from trustbo.models.effects.effect import Theta
@@ -27,7 +27,9 @@ class Latent(NamedTuple):
     predicted: np.ndarray  # (kept draw, mission, bound, robot), replicated rates
 
 
-def latent_of(density: Density, draws: Draws, kept: np.ndarray, rng: np.random.Generator) -> Latent:
+def latent_of(
+    density: Density, draws: JointDraws, kept: np.ndarray, rng: np.random.Generator
+) -> Latent:
     """Compute trust, likelihoods and predictions for given draws.
 
     Args:
@@ -69,7 +71,7 @@ def latent_of(density: Density, draws: Draws, kept: np.ndarray, rng: np.random.G
     return Latent(trust[place], mean, sd, log_likelihood[index], predicted[place])
 
 
-def replicate(density: Density, draws: Draws, rng: np.random.Generator) -> np.ndarray:
+def replicate(density: Density, draws: JointDraws, rng: np.random.Generator) -> np.ndarray:
     """Draw replicated rates (draw, mission, bound, robot) of the missions."""
     rates = np.empty((len(draws.c), *density.observations.contact_rate.shape))
     for i, _, predictor, mean in predictors(density, draws):
@@ -78,7 +80,7 @@ def replicate(density: Density, draws: Draws, rng: np.random.Generator) -> np.nd
 
 
 def predictors(
-    density: Density, draws: Draws
+    density: Density, draws: JointDraws
 ) -> Iterator[tuple[slice, Theta, LinearPredictor, np.ndarray]]:
     """Yield the slice, theta, predictors and mean predictors of each chunk of draws."""
     for where, theta in chunks(draws.theta):

@@ -23,7 +23,7 @@ from numpyro.infer.util import ParamInfo
 from scipy import optimize
 
 from trustbo.inference import importance
-from trustbo.inference.density import Density, Draws
+from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.diagnostics import complaints_of
 from trustbo.models.backend import own_settings
 from trustbo.statespace.matrices import namespace
@@ -125,7 +125,7 @@ def sample_by_nuts(
     warmup: int | None,
     seed: int,
     progress: bool = True,
-) -> tuple[Draws, dict[str, np.ndarray], dict[str, Any], list[str]]:
+) -> tuple[JointDraws, dict[str, np.ndarray], dict[str, Any], list[str]]:
     """Sample a posterior with NumPyro's NUTS in vectorised chains.
 
     Args:
@@ -178,11 +178,11 @@ def sample_by_nuts(
         stats["lp"] = stats["lp"] - log_jacobian
         values = density.scores.values(z)
         theta = density.model.theta(values, resolution)
-        drawn = Draws(theta, density.draw_coefficients(theta, rng))
+        drawn = JointDraws(theta, density.draw_coefficients(theta, rng))
     else:
         values = {name: samples[name] for name in density.scores.priors}
         theta = density.model.theta(values, resolution)
-        drawn = Draws(theta, samples["coefficients"], samples["linear_predictor"])
+        drawn = JointDraws(theta, samples["coefficients"], samples["linear_predictor"])
 
     by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
     found, complaints = complaints_of(by_chain, stats["diverging"])

@@ -8,7 +8,7 @@ import xarray as xr
 
 from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_choice, require_count, require_whole
-from trustbo.inference.density import Density, Draws
+from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.draws import QUANTILES, is_of_people, read_posterior, require_posterior
 from trustbo.inference.latent import predictors
 from trustbo.models.model import TrustModel
@@ -113,7 +113,7 @@ def predict_reports(
 
 
 def _of_person(
-    ahead: Density, draws: Draws, j: int, earlier: bool, alike: int, rng: np.random.Generator
+    ahead: Density, draws: JointDraws, j: int, earlier: bool, alike: int, rng: np.random.Generator
 ) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]:
     """Yield (bound, robot), draw weights, and mean and variance of trust for each report.
 
@@ -166,7 +166,7 @@ def _prediction(
     weight: np.ndarray,
     center: np.ndarray,
     var: np.ndarray,
-    draws: Draws,
+    draws: JointDraws,
     levels: int,
     rng: np.random.Generator,
 ) -> dict[str, Any]:

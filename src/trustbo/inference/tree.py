@@ -8,7 +8,7 @@ import xarray as xr
 
 from trustbo.data import NOWHERE, Mission
 from trustbo.display import slow_bar
-from trustbo.inference.density import Density, Draws
+from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.draws import (
     effects_of,
     parameters_of,
@@ -144,7 +144,7 @@ def with_latent(
     posterior: xr.DataTree,
     missions: Sequence[Mission],
     fitted: Density,
-    draws: Draws,
+    draws: JointDraws,
     *,
     progress: bool = True,
 ) -> xr.DataTree:

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from trustbo.inference.density import Density, Draws, chunks
+from trustbo.inference.density import Density, JointDraws, chunks
 from trustbo.inference.engine import Prior
 from trustbo.models.effects.effect import Theta
 
 
-def to_variables(density: Density, draws: Draws) -> dict[str, dict[str, np.ndarray]]:
+def to_variables(density: Density, draws: JointDraws) -> dict[str, dict[str, np.ndarray]]:
     """Return the variables of draws by group (`posterior` and one per effect) and name."""
     theta = draws.theta
     groups = {"posterior": _hyperparameters(density, theta)}
@@ -20,7 +20,7 @@ def to_variables(density: Density, draws: Draws) -> dict[str, dict[str, np.ndarr
     return groups
 
 
-def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -> Draws:
+def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -> JointDraws:
     """Make draws from variables by group and name, as returned by `to_variables`."""
     parameters = groups["posterior"]
     model = density.model
@@ -33,14 +33,14 @@ def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -
         effect.coefficients(groups[effect.group or "posterior"], theta, density.observations)
         for effect in model.terms
     ]
-    return Draws(theta, np.column_stack(c))
+    return JointDraws(theta, np.column_stack(c))
 
 
-def draw_prior(density: Density, n: int, rng: np.random.Generator) -> Draws:
+def draw_prior(density: Density, n: int, rng: np.random.Generator) -> JointDraws:
     """Draw hyperparameters and coefficients from the prior."""
     theta = density.model.theta(density.scores.draw(n, rng), density.observations.resolution)
     c = [density.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
-    return Draws(theta, np.concatenate(c))
+    return JointDraws(theta, np.concatenate(c))
 
 
 def prior_parameters(
