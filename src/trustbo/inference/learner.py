@@ -285,7 +285,9 @@ def learner_from_record(record: dict[str, Any], given: Model | None = None) -> L
     """
     if is_of_function(record):
         if isinstance(given, TrustModel):
-            raise TrustboError(f"the model is the function {record['name']!r}; got {given!r}.")
+            raise TrustboError(
+                f"the model is the function {record['name']!r}; got {type(given).__name__}."
+            )
         return FunctionLearner(model_of_record(record, given))
     if given is not None:
         require_kind("model", given, TrustModel, "give the model of the posterior")

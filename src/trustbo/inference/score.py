@@ -116,7 +116,8 @@ def score(
 
 def _follow(posterior: xr.DataTree) -> TrustFilter:
     """Make a filter from all draws of a posterior."""
-    return TrustFilter(posterior, max_draws=posterior["posterior"]["b"].size)
+    sizes = posterior["posterior"].sizes
+    return TrustFilter(posterior, max_draws=sizes["chain"] * sizes["draw"])
 
 
 def _predict(

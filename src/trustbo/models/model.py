@@ -237,8 +237,13 @@ class TrustModel(Summary, ABC):
         """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.
 
         All variables are sampled, except that trust is integrated out if rates are Gaussian. Call
-        this method within `jax.enable_x64(True)`; effects need float64.
+        this method within `jax.enable_x64(True)`; effects need float64. As in `fit`, default priors
+        are those for the features.
         """
+        of_features = self.for_features(observations.features)
+        if of_features.priors is not self.priors:
+            return of_features.program(observations)
+
         values = {
             name: numpyro.sample(name, prior.to_event(len(prior.batch_shape)))
             for name, prior in self.all_hyperpriors(observations).items()

@@ -44,7 +44,9 @@ _ACCEPT = 0.95
 _LAST_ACCEPT = 0.99
 """The same after a divergent transition."""
 _ATTEMPTS = 4
-"""Most runs of NUTS."""
+"""Runs of NUTS after which bad diagnostics are reported, if each has many draws."""
+_MANY = 4000
+"""Draws per chain in all runs before bad diagnostics are reported."""
 _SIZE = 200
 """Draws whose latent trust is drawn at once."""
 _STATS = {
@@ -94,7 +96,7 @@ def fit_function(
 
     flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in samples.z.items()}
     values = model.over_draws("constrain", 1, data)(flat)
-    by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
+    by_chain = {name: v.reshape(*stats["lp"].shape, *v.shape[1:]) for name, v in values.items()}
 
     n_missions = len(missions)
     variables = {
@@ -296,11 +298,11 @@ def _sampled(
     seed: int,
     progress: bool,
 ) -> tuple[Samples, dict[str, float], list[str]]:
-    """Run NUTS until the diagnostics are good, at most `_ATTEMPTS` times.
+    """Run NUTS until the diagnostics are good, or until it has had many draws.
 
     Each run starts from draws of the run before. Draws of runs without divergent transitions are
-    joined, and as many as were asked for are kept, evenly spaced. After a divergence, earlier draws
-    are discarded, and steps are smaller.
+    joined, and as many as were asked for are kept, evenly spaced, or all if those are too few.
+    After a divergence, earlier draws are discarded, and steps are smaller.
 
     Returns:
         Samples, their diagnostics, and the failed checks of the last attempt.
@@ -308,6 +310,7 @@ def _sampled(
     sampler = _sampler(model)
     accept = _ACCEPT
     runs: list[Samples] = []
+    most = max(_ATTEMPTS, _MANY // draws)
     attempt = 0
     while True:
         last = sampler.sample(
@@ -324,11 +327,15 @@ def _sampled(
             runs = []
             accept = _LAST_ACCEPT
 
-        joined = joined_samples([*runs, last], draws)
+        joined = joined_samples([*runs, last])
         found, complaints = complaints_of(joined.z, joined.fields["diverging"])
         attempt += 1
-        if not complaints or attempt == _ATTEMPTS:
-            return joined, found, complaints
+        if not complaints or attempt == most:
+            few = joined.some(draws)
+            found_in_few, complaints_of_few = complaints_of(few.z, few.fields["diverging"])
+            if complaints_of_few:
+                return joined, found, complaints
+            return few, found_in_few, complaints_of_few
 
         if not last.fields["diverging"].any():
             runs.append(last)

@@ -105,6 +105,9 @@ class FunctionModel:
     def __repr__(self) -> str:
         return f"FunctionModel({self.in_short()})"
 
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"compiled": {}, "sampler": None}  # compiled code cannot be pickled
+
     def in_short(self) -> str:
         """Return the name of the function."""
         return f"the function {self.name}"
@@ -258,8 +261,7 @@ class FunctionModel:
         if method not in self.compiled:
             self.compiled[method] = jax.jit(jax.vmap(getattr(self, method), in_axes=axes))
         mapped = self.compiled[method]
-        arrays = {name: jnp.asarray(data[name]) for name in self.inputs}
-        arrays[RATES] = jnp.asarray(data[RATES])
+        arrays = {name: np.asarray(data[name]) for name in (*self.inputs, RATES)}
         return lambda *draws: self._called(mapped, (*draws, arrays))
 
     def _called(self, compiled: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:

@@ -56,6 +56,16 @@ class Samples(NamedTuple):
     step_size: float
     """Mean step size after warm-up."""
 
+    def some(self, draws: int) -> "Samples":
+        """Return `draws` evenly spaced draws of each chain."""
+        n = self.fields["diverging"].shape[1]
+        kept = np.linspace(0, n - 1, min(draws, n)).astype(int)
+        return Samples(
+            {name: values[:, kept] for name, values in self.z.items()},
+            {name: values[:, kept] for name, values in self.fields.items()},
+            self.step_size,
+        )
+
 
 class Sampler:
     """NUTS for a function, compiled for each number of draws and each shape of data."""
@@ -198,17 +208,15 @@ def coordinates_of(z: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.concatenate(parts, axis=1)
 
 
-def joined_samples(runs: Sequence[Samples], draws: int) -> Samples:
-    """Join the draws of runs, and keep `draws` of them per chain, evenly spaced."""
-
-    def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
-        every = np.concatenate(parts, axis=1)
-        return every[:, np.linspace(0, every.shape[1] - 1, draws).astype(int)]
-
-    first = runs[0]
-    z = {name: joined([run.z[name] for run in runs]) for name in first.z}
-    fields = {name: joined([run.fields[name] for run in runs]) for name in first.fields}
-    return Samples(z, fields, runs[-1].step_size)
+def joined_samples(runs: Sequence[Samples]) -> Samples:
+    """Join the draws of runs, chain by chain."""
+    names = runs[0].z
+    fields = runs[0].fields
+    return Samples(
+        {name: np.concatenate([run.z[name] for run in runs], axis=1) for name in names},
+        {name: np.concatenate([run.fields[name] for run in runs], axis=1) for name in fields},
+        runs[-1].step_size,
+    )
 
 
 def cold_start(n: int, chains: int, seed: int) -> Start:

@@ -1,0 +1,370 @@
+"""Models that are NumPyro functions: what they compute, how they are fitted, what is refused."""
+
+import functools
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+import xarray as xr
+from numpyro.infer.util import log_density
+from scipy import stats
+
+import trustbo as tb
+from trustbo.errors import PosteriorError
+from trustbo.inference import params_of
+from trustbo.inference.functions.function import as_model, fingerprint
+from trustbo.models import ContactRate, PooledTrust, TrustParams
+
+FEATURES = ("traversability", "line_of_sight")
+
+
+def linear(awareness, contact_rate=None):
+    """Drift that is linear in the features, with known noises."""
+    weight = numpyro.sample("weight", dist.Normal(0.0, 0.5).expand([2]).to_event(1))
+    level = numpyro.sample("level", dist.Normal(0.0, 0.3))
+    drift = awareness @ weight + level
+    with numpyro.plate("mission", len(awareness)):
+        rates = ContactRate(drift, 0.4, 0.05, 0.05)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    awareness = np.random.default_rng(0).uniform(size=(3, 5, 5, 2))
+    return tb.Workspace.from_awareness(awareness, features=FEATURES)
+
+
+@pytest.fixture(scope="module")
+def missions(workspace):
+    """Missions along different paths, with a rate that was not measured."""
+    truth = TrustParams(0.4, np.array([0.2, 0.3]), 0.05, 0.05, 0.05)
+    simulator = tb.simulation.ModelSimulator(workspace, truth)
+    paths = (
+        ((4, 0), (3, 1), (2, 2), (1, 3), (0, 4)),
+        ((4, 0), (3, 0), (2, 0), (1, 1), (0, 2), (0, 3), (0, 4)),
+        ((4, 0), (4, 1), (4, 2), (3, 3), (2, 4), (1, 4), (0, 4)),
+    )
+    run = [simulator.run(path, seed=n) for n, path in enumerate(paths)]
+    rates = run[1].contact_rate.copy()
+    rates[2, 1] = np.nan
+    run[1] = tb.Mission.from_arrays(
+        run[1].path, run[1].awareness, rates, features=FEATURES, robots=run[1].robots
+    )
+    return run
+
+
+@pytest.fixture(scope="module")
+def posterior(missions, workspace):
+    return tb.fit(missions, linear, workspace=workspace, draws=500, progress=False)
+
+
+def exact_posterior(missions):
+    """Mean and covariance of (weight, level) from the dense normal of all rates of `linear`."""
+    beta0, delta_w, delta_v, x0_mean, x0_sd = 0.4, 0.05, 0.05, 0.5, 0.5
+    precision = np.diag(1.0 / np.array([0.5, 0.5, 0.3]) ** 2)
+    shift = np.zeros(3)
+    for mission in missions:
+        n = len(mission.bounds)
+        response = np.array([[beta0 ** (k - j) if j <= k else 0.0 for j in range(n)]
+                             for k in range(n)])  # fmt: skip
+        start = beta0 ** np.arange(1, n + 1)
+        cov = delta_w**2 * response @ response.T + x0_sd**2 * np.outer(start, start)
+        cov += delta_v**2 * np.eye(n)
+        for i in range(mission.contact_rate.shape[1]):
+            design = response @ np.column_stack([mission.awareness[:, i], np.ones(n)])
+            y = mission.contact_rate[:, i] - start * x0_mean
+            seen = ~np.isnan(y)
+            inverse = np.linalg.inv(cov[np.ix_(seen, seen)])
+            precision += design[seen].T @ inverse @ design[seen]
+            shift += design[seen].T @ inverse @ y[seen]
+    cov = np.linalg.inv(precision)
+    return cov @ shift, cov
+
+
+def test_the_posterior_is_that_of_a_linear_regression(posterior, missions):
+    mean, cov = exact_posterior(missions)
+    draws = posterior["posterior"].to_dataset()
+    found = np.column_stack([draws["weight"].values.reshape(-1, 2), draws["level"].values.ravel()])
+
+    error = 5.0 * np.sqrt(np.diag(cov) / 400.0)  # at least 400 effective draws
+    np.testing.assert_array_less(np.abs(found.mean(0) - mean), error)
+    np.testing.assert_allclose(np.cov(found.T), cov, atol=0.3 * cov.max())
+
+
+def test_a_posterior_has_the_groups_of_a_model_class(posterior, missions):
+    ours = tb.fit(missions, PooledTrust(), draws=50, progress=False)
+    assert set(posterior.children) == set(ours.children)
+    for group in ("latent", "log_likelihood", "posterior_predictive", "observed_data"):
+        assert set(posterior[group].data_vars) == set(ours[group].data_vars)
+        assert posterior[group].to_dataset().sizes.keys() == ours[group].to_dataset().sizes.keys()
+
+
+def test_log_likelihoods_are_those_of_numpyro(posterior, missions):
+    z = np.concatenate([mission.awareness for mission in missions[:1]])[None]
+    y = missions[0].contact_rate[None]
+    one = posterior["posterior"].isel(chain=1, draw=17)
+    given = {name: jnp.asarray(one[name].values) for name in ("weight", "level")}
+    with jax.enable_x64(True):
+        total, _ = log_density(linear, (jnp.asarray(z), jnp.asarray(y)), {}, given)
+    prior = stats.norm(0.0, 0.5).logpdf(one["weight"]).sum()
+    prior += stats.norm(0.0, 0.3).logpdf(one["level"])
+    found = posterior["log_likelihood"]["contact_rate"].isel(chain=1, draw=17, mission=0)
+    np.testing.assert_allclose(found, float(total) - prior, rtol=1e-6)
+
+
+def test_latent_trust_follows_the_rates(posterior, missions):
+    """Where noise is small, trust is close to the measured rate."""
+    for j, mission in enumerate(missions):
+        rates = mission.contact_rate
+        trust = posterior["latent"]["trust_mean"].values[j, : len(rates)]
+        assert np.nanmax(np.abs(trust - rates)) < 0.2
+
+
+def test_draws_plan_like_the_parameters_of_a_model_class(posterior, workspace):
+    """The drift of `linear` is that of `TrustParams` with the same weights."""
+    draws = params_of(posterior, workspace)
+    values = posterior["posterior"].to_dataset()
+    n = draws.leading[0]
+    params = TrustParams(
+        np.full(n, 0.4), values["weight"].values.reshape(n, 2), values["level"].values.ravel(),
+        np.full(n, 0.05), np.full(n, 0.05),
+    )  # fmt: skip
+    for objective in tb.planning.OBJECTIVES:
+        planner = tb.Planner(workspace, (4, 0), (0, 4), objective)
+        plan, wanted = planner.plan(draws), planner.plan(params)
+        assert plan.path == wanted.path
+        np.testing.assert_allclose(plan.trust, wanted.trust, rtol=1e-9)
+        np.testing.assert_allclose(plan.bands, wanted.bands, rtol=1e-9)
+        np.testing.assert_allclose(plan.value, wanted.value, rtol=1e-9)
+
+    trust, expected = planner.trust_map(draws.draw([3, 5])), planner.trust_map(params.draw([3, 5]))
+    np.testing.assert_allclose(trust, expected, rtol=1e-9)
+    simulators = [
+        tb.simulation.ModelSimulator(workspace, given.draw(7)) for given in (draws, params)
+    ]
+    rates = [one.run(plan.path, seed=3).contact_rate for one in simulators]
+    np.testing.assert_allclose(*rates, rtol=1e-9)
+    filters = [tb.inference.TrustFilter(given, 3) for given in (draws, params)]
+    for k, y in enumerate(rates[0]):
+        z = workspace.along(plan.path)[k]
+        states = [one.update(z, y, plan.path[k : k + 2]) for one in filters]
+        np.testing.assert_allclose(*states, rtol=1e-9)
+
+
+def test_a_posterior_is_continued_from_the_last_one(posterior, missions, workspace):
+    again = tb.fit(
+        missions, linear, workspace=workspace, draws=500, start=posterior, progress=False
+    )
+    mean, cov = exact_posterior(missions)
+    error = 5.0 * np.sqrt(cov[2, 2] / 400.0)
+    assert abs(float(again["posterior"]["level"].mean()) - mean[2]) < error
+
+
+def test_a_posterior_in_a_file_needs_its_function_in_another_process(posterior, tmp_path):
+    file = tmp_path / "posterior.nc"
+    posterior.to_netcdf(file)
+    code = f"""
+import trustbo as tb, xarray as xr
+tree = xr.open_datatree({str(file)!r})
+try:
+    tb.inference.params_of(tree)
+except tb.TrustboError as error:
+    print(error)
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "give it with model=" in found.stdout
+
+    tree = xr.open_datatree(file).load()
+    draws = params_of(tree, model=linear)
+    np.testing.assert_array_equal(
+        draws.values["level"], posterior["posterior"]["level"].values.ravel()
+    )
+    with pytest.raises(tb.TrustboError, match="not of 'other'"):
+        params_of(tree, model=functools.update_wrapper(functools.partial(shaped), other))
+
+
+def other(awareness, contact_rate=None):
+    """Another function."""
+
+
+def shaped(awareness, contact_rate=None, n=2):
+    a = numpyro.sample("a", dist.Normal())
+    rates = ContactRate(a + awareness[..., :n, 0], 0.5, 0.1, 0.1)
+    numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+def by_mission(awareness, contact_rate=None):
+    level = numpyro.sample("level", dist.Normal(0.2, 0.1))
+    with numpyro.plate("mission", len(awareness)):
+        off = numpyro.sample("off", dist.Normal(0.0, 0.05))
+        rates = ContactRate(level + off[:, None, None] + 0.0 * awareness[..., 0], 0.4, 0.05, 0.05)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+def test_variables_of_one_mission_are_drawn_for_the_next(missions, workspace):
+    fitted = tb.fit(
+        missions, by_mission, workspace=workspace, draws=500, check=False, progress=False
+    )
+    assert fitted["posterior"]["off"].dims == ("chain", "draw", "mission")
+    assert fitted["posterior"].sizes["mission"] == 3
+
+    draws = params_of(fitted, workspace)
+    u = draws.inputs(workspace.awareness.values)
+    known = ~np.isnan(u[0])
+    assert np.ptp(u[:, known], axis=1).max() < 1e-12  # equal in all bounds of a mission
+    off = u[:, known][:, 0] - fitted["posterior"]["level"].values.ravel()
+    np.testing.assert_allclose(off.std(), 0.05, rtol=0.1)
+
+
+def refused(inner):
+    def model(awareness, contact_rate=None):
+        inner(awareness, contact_rate)
+
+    return model
+
+
+def without_site(awareness, rates):
+    numpyro.sample("a", dist.Normal())
+
+
+def normal(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    numpyro.sample("contact_rate", dist.Normal(a + awareness[..., 0], 0.1), obs=rates)
+
+
+def unobserved(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    numpyro.sample("contact_rate", ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1))
+
+
+def discrete(awareness, rates):
+    a = numpyro.sample("a", dist.Bernoulli(0.5))
+    numpyro.sample("contact_rate", ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1), obs=rates)
+
+
+def without_variables(awareness, rates):
+    numpyro.sample("contact_rate", ContactRate(awareness[..., 0], 0.5, 0.1, 0.1), obs=rates)
+
+
+def broken(awareness, rates):
+    raise RuntimeError("no such luck")
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (refused(without_site), "has no site 'contact_rate', only 'a'"),
+        (refused(normal), "has the distribution Normal; it must be tb.models.ContactRate"),
+        (refused(unobserved), "is not observed; pass obs=contact_rate"),
+        (refused(discrete), "the site 'a' .* is discrete"),
+        (refused(without_variables), "has no latent variable"),
+        (refused(broken), "failed with RuntimeError: no such luck"),
+        (shaped, r"must have the shape .* = \(4, 8, 3\).*got \(4, 8, 2\)"),
+        (lambda z, rates=None: None, "must have the parameters awareness and contact_rate"),
+        (lambda awareness, contact_rate, colour: None, "the parameter 'colour'"),
+        (PooledTrust, "model: got type PooledTrust|give a model"),
+    ],
+)
+def test_a_function_that_is_no_model_is_refused_before_sampling(missions, function, message):
+    with pytest.raises(tb.TrustboError, match=message):
+        tb.fit(missions, function, progress=False)
+
+
+def numbered(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    drift = a * jnp.arange(len(awareness))[:, None, None] + awareness[..., 0]
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
+
+
+def with_history(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    drift = a * jnp.cumsum(awareness[..., 0], axis=1)
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
+
+
+def standardised(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    x = awareness[..., 0]
+    drift = a * (x - x.mean()) / x.std()
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
+
+
+def with_offset(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    given = ContactRate(awareness[..., 0], 0.5, 0.1, 0.1, offset=a * awareness[..., 1])
+    numpyro.sample("contact_rate", given, obs=rates)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (numbered, "changes with the order or the number of bounds or missions"),
+        (with_history, "changes with the order"),
+        (standardised, "changes with the order"),
+        (with_offset, "has an offset"),
+    ],
+)
+def test_a_drift_that_depends_on_more_than_its_bound_cannot_plan(workspace, function, message):
+    with pytest.raises(tb.TrustboError, match=message):
+        tb.Campaign(workspace, (4, 0), (0, 4), model=refused(function))
+
+
+def test_bad_diagnostics_are_refused_and_the_posterior_is_kept(missions):
+    """Two modes, between which chains do not move."""
+
+    def model(awareness, contact_rate=None):
+        a = numpyro.sample("a", dist.Normal(0.0, 1.0))
+        drift = jnp.abs(a) + 0.0 * awareness[..., 0]
+        numpyro.sample("contact_rate", ContactRate(drift, 0.1, 0.01, 0.01), obs=contact_rate)
+
+    with pytest.raises(PosteriorError, match=r"R-hat|bulk ESS") as error:
+        tb.fit(missions, model, draws=1000, progress=False)
+    assert "posterior" in error.value.posterior.children
+
+
+def test_other_samplers_are_refused(missions):
+    with pytest.raises(tb.TrustboError, match="sampled by 'nuts'; got 'importance'"):
+        tb.fit(missions, linear, sampler="importance")
+
+
+def scaled(scale):
+    def model(awareness, contact_rate=None):
+        a = numpyro.sample("a", dist.Normal(0.0, scale))
+        rates = ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    return model
+
+
+def test_a_fingerprint_tells_functions_apart_but_not_their_comments():
+    assert fingerprint(scaled(1.0)) == fingerprint(scaled(1.0))
+    assert fingerprint(scaled(1.0)) != fingerprint(scaled(2.0))
+    assert fingerprint(linear) != fingerprint(by_mission)
+    assert fingerprint(PooledTrust().program) != fingerprint(
+        PooledTrust(memory="deviation").program
+    )
+    assert fingerprint(functools.partial(shaped, n=3)) != fingerprint(
+        functools.partial(shaped, n=2)
+    )
+    assert as_model(linear) is as_model(linear)
+
+
+@pytest.mark.slow
+def test_the_program_of_a_model_class_is_a_function(missions):
+    """The posterior and log-likelihoods are those of the class, sampled in other coordinates."""
+    model = PooledTrust()
+    ours = tb.fit(missions, model, sampler="nuts", draws=2000, seed=1, progress=False)
+    theirs = tb.fit(missions, model.program, draws=2000, seed=1, progress=False)
+    for name in ("beta0", "delta_w", "delta_v"):
+        a = ours["posterior"][name]
+        b = theirs["posterior"][name]
+        assert abs(float(a.mean() - b.mean())) < 0.1 * float(a.std())
+
+    totals = [tree["log_likelihood"]["contact_rate"].sum("mission") for tree in (ours, theirs)]
+    means = [float(total.mean()) for total in totals]
+    assert abs(means[0] - means[1]) < 0.1 * float(totals[0].std())
