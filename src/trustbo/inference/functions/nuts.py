@@ -74,6 +74,11 @@ class Sampler:
         self.model = model
         self._compiled: dict[Any, Callable[..., Any]] = {}
 
+    @property
+    def n_compiled(self) -> int:
+        """Number of compilations so far."""
+        return sum(run._cache_size() for run in self._compiled.values())  # pyright: ignore[reportFunctionMemberAccess]
+
     def sample(
         self,
         data: Data,
