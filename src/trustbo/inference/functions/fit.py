@@ -2,18 +2,25 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
+from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
-from trustbo.errors import TrustboError, require_kind
+from trustbo.errors import TrustboError, require_kind, warn
 from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.draws import joined_draws
-from trustbo.inference.functions.data import Data, data_of, data_of_bounds, observations_of
+from trustbo.inference.functions.data import (
+    RATES,
+    Data,
+    data_of,
+    data_of_bounds,
+    observations_of,
+)
 from trustbo.inference.functions.draws import FunctionDraws
 from trustbo.inference.functions.function import Found, FunctionModel, Site, as_model
 from trustbo.inference.functions.nuts import (
@@ -45,6 +52,10 @@ _LAST_ACCEPT = 0.99
 """The same after a divergent transition."""
 _ATTEMPTS = 4
 """Runs of NUTS after which bad diagnostics are reported, if each has many draws."""
+_PATIENT = 2
+"""Runs after which the chains of the drift count instead of those of the variables."""
+_CHECKED = 100
+"""Most measured bounds whose drift is checked."""
 _MANY = 4000
 """Draws per chain in all runs before bad diagnostics are reported."""
 _SIZE = 200
@@ -88,7 +99,7 @@ def fit_function(
         require_plannable(model, workspace, data)
 
     first = _start(model, sites, data, start, chains, seed)
-    samples, found, complaints = _sampled(
+    samples, verdict = _sampled(
         model, data, sites, first, warmup, draws, seed=seed, progress=progress
     )
     stats = {ours: samples.fields[theirs] for theirs, ours in _STATS.items()}
@@ -114,11 +125,18 @@ def fit_function(
         "sampler": "nuts",
         "seed": seed,
         "step_size": samples.step_size,
-        **found,
+        **verdict.diagnostics,
+        "not_identified": verdict.not_identified,
         **{f"{name}_version": version for name, version in VERSIONS.items()},
     }
 
-    return tree, complaints
+    if verdict.not_identified:
+        warn(
+            f"the chains of {joined_names(verdict.not_identified)} differ, but those of "
+            "the drift and noises agree: plans and predictions can be used, these variables "
+            "cannot. Other values of theirs may give the same drift."
+        )
+    return tree, verdict.complaints
 
 
 def with_latent_of_function(
@@ -287,6 +305,45 @@ def _sampler(model: FunctionModel) -> Sampler:
     return model.sampler
 
 
+class Verdict(NamedTuple):
+    """Diagnostics of samples."""
+
+    diagnostics: dict[str, float]
+    complaints: list[str]
+    """Failed checks."""
+    not_identified: list[str]
+    """Variables whose chains differ, although those of the drift and the noises agree."""
+
+
+def _judge(model: FunctionModel, data: Data, samples: Samples, *, by_drift: bool) -> Verdict:
+    """Check samples: the chains of the variables or, with `by_drift`, of what plans depend on.
+
+    Variables may differ between chains although the drift does not, such as the weights of a neural
+    network, whose units can be exchanged.
+    """
+    diverging = samples.fields["diverging"]
+    found, complaints = complaints_of(samples.z, diverging)
+    if not complaints or not by_drift:
+        return Verdict(found, complaints, [])
+
+    shape = diverging.shape
+    flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in samples.z.items()}
+    values = model.over_draws("constrain", 1, data)(flat)
+    space, inputs = model.over_draws("form", 2, data)(values, _keys(diverging.size, 0))
+    measured = np.flatnonzero(~np.isnan(data[RATES].ravel()))
+    some = measured[np.linspace(0, len(measured) - 1, min(_CHECKED, len(measured))).astype(int)]
+    u = (inputs.drift + inputs.offset).reshape(diverging.size, -1)[:, some]
+
+    used = {"drift": u} | {n: v for n, v in space._asdict().items() if v is not None}
+    by_chain = {name: v.reshape(*shape, -1) for name, v in used.items()}
+    found_of_drift, complaints_of_drift = complaints_of(by_chain, diverging)
+    if complaints_of_drift:
+        return Verdict(found, complaints, [])
+
+    alone = {name: complaints_of({name: v}, diverging)[1] for name, v in samples.z.items()}
+    return Verdict(found_of_drift, [], [name for name, failed in alone.items() if failed])
+
+
 def _sampled(
     model: FunctionModel,
     data: Data,
@@ -297,7 +354,7 @@ def _sampled(
     *,
     seed: int,
     progress: bool,
-) -> tuple[Samples, dict[str, float], list[str]]:
+) -> tuple[Samples, Verdict]:
     """Run NUTS until the diagnostics are good, or until it has had many draws.
 
     Each run starts from draws of the run before. Draws of runs without divergent transitions are
@@ -305,7 +362,7 @@ def _sampled(
     After a divergence, earlier draws are discarded, and steps are smaller.
 
     Returns:
-        Samples, their diagnostics, and the failed checks of the last attempt.
+        Samples, and the verdict on them.
     """
     sampler = _sampler(model)
     accept = _ACCEPT
@@ -327,15 +384,13 @@ def _sampled(
             runs = []
             accept = _LAST_ACCEPT
 
-        joined = joined_samples([*runs, last])
-        found, complaints = complaints_of(joined.z, joined.fields["diverging"])
         attempt += 1
-        if not complaints or attempt == most:
+        joined = joined_samples([*runs, last])
+        verdict = _judge(model, data, joined, by_drift=attempt >= _PATIENT)
+        if not verdict.complaints or attempt == most:
             few = joined.some(draws)
-            found_in_few, complaints_of_few = complaints_of(few.z, few.fields["diverging"])
-            if complaints_of_few:
-                return joined, found, complaints
-            return few, found_in_few, complaints_of_few
+            of_few = _judge(model, data, few, by_drift=bool(verdict.not_identified))
+            return (joined, verdict) if of_few.complaints else (few, of_few)
 
         if not last.fields["diverging"].any():
             runs.append(last)
