@@ -28,10 +28,13 @@ from trustbo.models.draws import Draws
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.simulation import Truth
 from trustbo.workspace import Workspace
+from trustbo.workspace.grid import Location
 
 if TYPE_CHECKING:
     from trustbo.plots.explore import Explorer
 
+_N_PRIOR_DRAWS = 1000
+"""Draws from the prior for `Result.trust` before anything was learned."""
 _FIRST_COLUMNS = (
     "mission",
     "status",
@@ -203,6 +206,58 @@ class Result(Summary):
     def path(self) -> list[Cell]:
         """Recommended path."""
         return list(self.plan.path)
+
+    def trust(
+        self,
+        robot: str | None = None,
+        cell: Location | None = None,
+        *,
+        move: str | None = None,
+        as_rate: bool = False,
+    ) -> xr.DataArray:
+        """Compute how trustworthy a robot is while the lead enters a cell, after all missions.
+
+        The draws are those of the last posterior, with the expected effects of robots in the next
+        mission. Before anything was learned, they are drawn from the prior, without the effects of
+        places and robots, which are 0 on average.
+
+        Args:
+            robot: Name of a robot of T2; by default all robots.
+            cell: Cell (row, col) that the lead enters, or a position in it (see
+                `Workspace.locate`); by default all cells.
+            move: Direction of the bound that enters the cell, such as `"ne"`; by default the mean
+                over all directions.
+            as_rate: Whether to return the expected contact rate instead of trust.
+
+        Returns:
+            Stationary trust of each posterior draw, as a DataArray with the dims (draw, robot, row,
+            col), without those of a robot or cell that is given; see `planning.Planner.trust`.
+
+        Raises:
+            TrustboError: If the robot or move is unknown, the cell is off the grid or impassable,
+                or no such bound enters the cell.
+
+        Example:
+            >>> trust = result.trust("r2", (3, 4))
+            >>> float(trust.mean()), float(trust.std())
+        """
+        return self._base.trust(self._beliefs, robot, cell, move=move, as_rate=as_rate)
+
+    def robot_maps(self) -> xr.Dataset:
+        """Compute maps of the trust in each robot after all missions.
+
+        The draws are those of `trust`.
+
+        Returns:
+            Dataset with the dims (robot, y, x) of the mean `trust_mean` and standard deviation
+            `trust_sd` of trust, and the mean `contact_rate`; see `planning.Planner.robot_maps`.
+        """
+        return self._base.robot_maps(self._beliefs)
+
+    @property
+    def _beliefs(self) -> Draws:
+        """Draws of the last posterior, or of the prior before anything was learned."""
+        return self.draw_prior(_N_PRIOR_DRAWS) if self.state.posterior is None else self.belief
 
     @computed
     def trust_map(self) -> xr.DataArray:

@@ -35,6 +35,7 @@ from trustbo.planning.problem import (
     risk_of,
 )
 from trustbo.planning.recursion import Recursion, states_along, trust_recursion
+from trustbo.planning.robot_trust import robot_maps, robot_trust
 from trustbo.planning.trust_map import cost_of, trust_map
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -380,6 +381,68 @@ class Planner(Summary):
             graph.add_edge(origin, (row, col), **{name: float(v[k]) for name, v in values.items()})
 
         return graph
+
+    @computing()
+    def trust(
+        self,
+        params: Draws | xr.DataTree,
+        robot: str | None = None,
+        cell: Location | None = None,
+        *,
+        move: str | None = None,
+        as_rate: bool = False,
+    ) -> xr.DataArray:
+        """Compute how trustworthy a robot is while the lead enters a cell.
+
+        Expected trust is carried over from bound to bound, so it depends on the path. This method
+        returns the stationary trust (I - B0)^-1 u instead, the limit of expected trust if a bound
+        with the drift u is repeated. It depends on the bound only, and equals u if beta0 is 0 or
+        the model has `memory="deviation"`. The trust at a cell is the mean over the bounds that
+        enter it.
+
+        Args:
+            params: Posterior from `fit`, or parameters of any model.
+            robot: Name of a robot of T2; by default all robots.
+            cell: Cell (row, col) that the lead enters, or a position in it (see
+                `Workspace.locate`); by default all cells.
+            move: Direction of the bound that enters the cell, such as `"ne"` (see
+                `workspace.MOVE_NAMES`); by default the mean over all directions.
+            as_rate: Whether to return the expected contact rate at this trust, in [0, 1]. Gaussian
+                contact rates have trust as their mean, which is limited to [0, 1]. With the family
+                `"beta_binomial"`, trust is the logit of the contact rate.
+
+        Returns:
+            DataArray with the dims (draw, robot, row, col), without those of a robot or cell that
+            is given, and without draw for a single set of parameters. It is NaN where no bound
+            enters a cell, and, with a warning, for draws in which trust diverges.
+
+        Raises:
+            TrustboError: If the robot or move is unknown, the cell is off the grid or impassable,
+                no such bound enters the cell, or trust diverges in all draws.
+
+        Example:
+            >>> planner.trust(posterior, "r2", (3, 4)).quantile([0.05, 0.5, 0.95])
+        """
+        draws = draws_of(params, self.workspace)
+        family = self.problem.likelihood
+        return robot_trust(self.workspace, family, draws, robot, cell, move=move, as_rate=as_rate)
+
+    @computing()
+    def robot_maps(self, posterior: Draws | xr.DataTree) -> xr.Dataset:
+        """Compute maps of the trust in each robot under a posterior.
+
+        The draws are read in parts, so large maps fit in memory.
+
+        Args:
+            posterior: Posterior from `fit`, or parameters of any model.
+
+        Returns:
+            Dataset with the dims (robot, y, x), whose coordinates are those of `maps`, of the mean
+            `trust_mean` and standard deviation `trust_sd` of `trust`, and the mean `contact_rate`
+            of `trust(as_rate=True)`. Cells that no bound enters are NaN.
+        """
+        draws = draws_of(posterior, self.workspace)
+        return robot_maps(self.workspace, self.problem.likelihood, draws)
 
     @computing()
     def trust_map(

@@ -42,8 +42,13 @@ class Recursion(NamedTuple):
 
     def steady_state(self) -> np.ndarray:
         """Return the limit of the team's trust if a bound is repeated, (..., move, row, col)."""
+        return self.steady_states().mean(self.start.ndim - 1)
+
+    def steady_states(self) -> np.ndarray:
+        """Return the limit (I - transition)^-1 drift of each state if a bound is repeated."""
         gain = np.linalg.inv(np.eye(self.start.shape[-1]) - self.transition)
-        return np.einsum("...st,...tmrc->...mrc", gain, self.drift) / self.start.shape[-1]
+        drift = self.drift.reshape(*self.start.shape, -1)
+        return (gain @ drift).reshape(self.drift.shape)
 
 
 def trust_recursion(
