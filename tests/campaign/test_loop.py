@@ -109,6 +109,36 @@ def test_maps_are_over_the_posterior_and_lie_in_their_place(tmp_path):
     assert maps["cost"].sel(x=x, y=y) == maps["cost"].isel(y=1, x=2)
 
 
+def test_trust_in_a_robot_at_a_place_is_that_of_the_last_posterior(result, workspace):
+    draws = params_of(result.posterior, workspace)  # of robots, as their effects differ
+    z = workspace.awareness.values[1, :, 2, 3]  # of r2
+    moves = np.flatnonzero(workspace.passable_bounds.values[:, 2, 3])
+    drift = z[moves] @ draws.beta[:, 1].T + draws.b[:, 1] + draws.place[:, 0, 2, 3]
+    drift = drift + draws.place_bound[:, 0, moves, 2, 3].T
+    expected = drift.mean(0) / (1.0 - draws.beta0[:, 1])
+
+    trust = result.trust("r2", (2, 3))
+    np.testing.assert_allclose(trust, expected, rtol=1e-9)
+    assert trust.dims == ("draw",)
+    x, y = workspace.grid.center((2, 3))
+    assert result.trust("r2", {"x": x, "y": y}).identical(trust)
+    np.testing.assert_allclose(result.trust()[:, 1, 2, 3], expected, rtol=1e-9)
+    maps = result.robot_maps()
+    np.testing.assert_allclose(maps["trust_mean"].sel(robot="r2")[2, 3], expected.mean())
+    np.testing.assert_allclose(maps["trust_sd"].sel(robot="r2")[2, 3], expected.std())
+
+
+def test_trust_before_anything_is_learned_is_that_of_the_prior(workspace):
+    campaign = tb.Campaign(workspace, *ENDS)
+    trust = campaign.trust("r2", (2, 3))
+    draws = campaign.draw_prior(len(trust))
+    moves = np.flatnonzero(workspace.passable_bounds.values[:, 2, 3])
+    z = workspace.awareness.values[1, moves, 2, 3].mean(0)
+    expected = (draws.beta @ z + draws.b) / (1.0 - draws.beta0)
+    np.testing.assert_allclose(trust, expected, rtol=1e-9)
+    assert trust.std() > 0.1
+
+
 def test_features_named_like_maps_are_renamed_in_maps():
     awareness = np.random.default_rng(3).uniform(size=(2, 4, 4, 2))
     workspace = tb.Workspace.from_awareness(awareness, features=("cost", "x"))
