@@ -4,11 +4,13 @@ import networkx as nx
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.special import expit
 
 from trustbo.errors import TrustboError
 from trustbo.inference import fit, params_of, sample_prior
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.models import PooledTrust, TrustParams
+from trustbo.models.params import CoupledParams, RobotParams
 from trustbo.planning import Planner, expected_trust, reference
 from trustbo.planning.paths import STEPS
 from trustbo.simulation import ModelSimulator
@@ -99,22 +101,112 @@ def test_the_cost_of_a_bound_is_taken_from_the_value(workspace):
 
 
 def test_the_graph_of_bounds_is_for_any_algorithm_of_networkx(workspace):
-    """Without memory of trust, losses of bounds add up to those of the plan."""
     p_fail = np.random.default_rng(1).uniform(0.0, 0.2, (8, 5, 6))
-    planner = Planner(workspace, *ENDS, bound_cost=0.01, failure_cost=0.0, max_bounds=8)
-    planner = planner.with_risk(p_fail)
-    forgetful = PARAMS._replace(beta0=0.0)
-    graph, plan = planner.graph(forgetful), planner.plan(forgetful)
+    planner = Planner(workspace, *ENDS, bound_cost=0.01, failure_cost=2.0).with_risk(p_fail)
+    graph, plan = planner.graph(PARAMS), planner.plan(PARAMS)
     assert len(graph) == 27
     assert graph.nodes[4, 0] == {"x": 10.0, "y": 10.0}
     assert graph.edges[(4, 0), (3, 1)]["length"] == pytest.approx(20.0 * np.sqrt(2.0))
-    assert nx.dijkstra_path_length(graph, *ENDS, weight="lost") == pytest.approx(-plan.value)
     risk = nx.path_weight(graph, plan.path, "risk")
     assert np.exp(-risk) == pytest.approx(planner.problem.risk.survival(plan.path), rel=1e-12)
-    settled = planner.graph(PARAMS).edges[plan.path[:2]]
-    assert settled["cost"] == pytest.approx(np.log1p(np.exp(-settled["drift"] / 0.4)) + 0.01)
+    edge = graph.edges[plan.path[:2]]
+    assert edge["trust"] == pytest.approx(edge["drift"] / 0.4)
+    assert edge["lost"] == pytest.approx(max(0.0, 1.0 - edge["trust"]) + 0.01)
+    assert edge["cost"] == pytest.approx(edge["lost"] - 2.0 * np.expm1(-edge["risk"]))
     with pytest.raises(TrustboError, match="beta0"):
         planner.graph(PARAMS._replace(beta0=1.0))
+
+
+def problem_without_memory(rng, objective, **options):
+    """A planner of a random workspace, and parameters of any kind that carry nothing over."""
+    n = int(rng.integers(1, 4))
+    scale = rng.choice([0.3, 3.0])
+    b = rng.normal(0.4, 0.3, n)
+    sd = float(rng.choice([0.05, 0.4]))
+    params = {
+        "pooled": TrustParams(0.0, rng.normal(0.0, scale, 2), b[0], 0.1, sd),
+        "deviation": TrustParams(0.6, rng.normal(0.0, scale, 2), b[0], 0.1, sd, memory="deviation"),
+        "robots": RobotParams(
+            np.zeros(n), rng.normal(0.0, scale, (n, 2)), b, np.full(n, 0.1), np.full(n, sd)
+        ),
+        "coupled": CoupledParams(
+            np.zeros((n, n)), rng.normal(0.0, scale, (2, n, n)), b, np.eye(n), sd**2 * np.eye(n)
+        ),
+    }[str(rng.choice(["pooled", "deviation", "robots", "coupled"]))]
+
+    while True:
+        shape = tuple(rng.integers(2, 6, 2).tolist())
+        passable = rng.random(shape) > 0.2
+        if passable.sum() < 2:
+            continue
+        ends = rng.choice(np.argwhere(passable), 2, replace=False).tolist()
+        workspace = Workspace.from_awareness(rng.random((n, 8, *shape, 2)), passable)
+        bound_cost = rng.choice([0.0, 0.2]) * rng.exponential(size=(8, *shape))
+        options = {"max_bounds": passable.size} | options
+        try:
+            planner = Planner(workspace, *ends, objective, bound_cost=bound_cost, **options)
+        except nx.NetworkXNoPath:
+            continue
+        return planner, params
+
+
+@pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
+@pytest.mark.parametrize("objective", ["lost_contact", "terminal"])
+def test_without_memory_the_shortest_path_of_networkx_is_the_plan(objective, family):
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        planner, params = problem_without_memory(rng, objective, family=family)
+        graph, plan = planner.graph(params), planner.plan(params)
+        assert min(cost for _, _, cost in graph.edges(data="cost")) >= 0.0
+
+        path = nx.shortest_path(graph, planner.start, planner.goal, weight="cost")
+        assert plan.exact
+        assert planner.evaluate(path, params).value == pytest.approx(plan.value, rel=1e-9)
+        score = graph.graph["constant"] - nx.path_weight(graph, path, "cost")
+        value = expit(score) if objective == "terminal" else score
+        assert value == pytest.approx(plan.value, rel=1e-9, abs=1e-12)
+
+
+def test_the_shortest_path_of_networkx_is_at_least_as_good_as_a_plan_of_few_bounds():
+    longer = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        planner, params = problem_without_memory(rng, "lost_contact", max_bounds="shortest")
+        graph, plan = planner.graph(params), planner.plan(params)
+        path = nx.shortest_path(graph, planner.start, planner.goal, weight="cost")
+        cost = nx.path_weight(graph, path, "cost")
+        if len(path) == len(plan.path):
+            assert -cost == pytest.approx(plan.value, rel=1e-9, abs=1e-12)
+        else:
+            assert -cost > plan.value
+            longer += 1
+    assert longer > 0
+
+
+def test_costs_of_a_mean_order_the_paths_with_the_same_number_of_bounds(workspace):
+    forgetful = PARAMS._replace(beta0=0.0)
+    planner = Planner(workspace, *ENDS, "mean", bound_cost=0.01, max_bounds="shortest+1")
+    graph = planner.graph(forgetful)
+    assert min(cost for _, _, cost in graph.edges(data="cost")) >= 0.0
+    for path in reference.every_path(planner.problem.paths):
+        mean = nx.path_weight(graph, path, "cost") / (len(path) - 1)
+        value = planner.evaluate(path, forgetful).value
+        assert graph.graph["constant"] - mean == pytest.approx(value, rel=1e-9)
+
+
+def test_failures_cost_at_most_what_the_graph_says(workspace):
+    forgetful = PARAMS._replace(beta0=0.0)
+    p_fail = np.random.default_rng(1).uniform(0.0, 0.2, (8, 5, 6))
+    planner = Planner(workspace, *ENDS, failure_cost=2.0).with_risk(p_fail)
+    graph = planner.graph(forgetful)
+    for path in reference.every_path(
+        Planner(workspace, *ENDS, max_bounds="shortest").problem.paths
+    ):
+        plan = planner.evaluate(path, forgetful)
+        lost = nx.path_weight(graph, path, "lost") + 2.0 * (1.0 - plan.p_arrive)
+        assert lost == pytest.approx(-plan.value, rel=1e-9)
+        cost = nx.path_weight(graph, path, "cost")
+        assert -plan.value < cost < -plan.value + 2.0 * plan.p_fail.sum() ** 2
 
 
 def test_regret_and_shares_of_cells_are_what_enumeration_says(workspace, draws):

@@ -1,14 +1,18 @@
 """Plans against all admissible paths written out, against networkx, and by closed forms."""
 
+import jax.numpy as jnp
 import networkx as nx
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
 from fuzz_plans import draw_problem, faults
 from peers.every_path import TooManyError, best_walk
 
 from trustbo.errors import TrustboError
 from trustbo.hazard.components import Components
-from trustbo.models import TrustParams
+from trustbo.inference.learner import learner_of
+from trustbo.models import ContactRate, TrustParams
 from trustbo.planning import OBJECTIVES, InfeasibleError, Planner, reference
 from trustbo.planning.objectives import Objective
 from trustbo.workspace import Workspace
@@ -49,12 +53,60 @@ def test_plans_are_the_best_of_all_paths_written_out(seed):
         assert faults(planner, params, world, best) == ([], True)
 
 
+@pytest.mark.parametrize("seed", [9, 10])
 @pytest.mark.filterwarnings("ignore:Mean of empty slice")
-def test_networkx_finds_plans_of_the_same_value():
-    for planner, params, _, best in random_problems(9, 40, 500):
-        if best > -np.inf:
-            expected = reference.plan(planner, params).value
-            assert planner.plan(params).value == pytest.approx(expected, rel=1e-9, abs=1e-9)
+def test_networkx_finds_plans_of_the_same_value(seed):
+    refused = 0
+    for planner, params, _, best in random_problems(seed, 50, 500):
+        if best == -np.inf:
+            with pytest.raises(InfeasibleError) as expected:
+                reference.plan(planner, params)
+            with pytest.raises(InfeasibleError) as error:
+                planner.plan(params)
+            assert error.value.p_fail == pytest.approx(expected.value.p_fail, rel=1e-9)
+            refused += 1
+            continue
+
+        x0 = None if planner.workspace.team.n_robots < 3 else [0.9, -0.3, 0.2]
+        expected = reference.plan(planner, params, x0=x0)
+        plan = planner.plan(params, x0=x0)
+        assert plan.value == pytest.approx(expected.value, rel=1e-9, abs=1e-9)
+        assert expected.exact
+        assert expected.limit == expected.value
+    assert refused > 0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {}, {"objective": "terminal"}, {"objective": "mean", "max_bounds": 5},
+        {"family": "censored"}, {"family": "beta_binomial", "max_bounds": "shortest"},
+        {"max_failure": 0.2, "failure_cost": 3.0}, {"objective": "mean", "max_failure": 0.2},
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("by_robot", [False, True])
+def test_networkx_finds_plans_of_functions(workspace, options, by_robot):
+    """Draws of a NumPyro function, with and without weights of each robot."""
+
+    def model(awareness, contact_rate=None):
+        weight = dist.HalfNormal(0.5).expand([2]).to_event(1)
+        most = numpyro.sample("most", weight if by_robot else dist.HalfNormal(0.5))
+        fading = dist.Beta(2.0, 2.0).expand([2]).to_event(1)
+        beta0 = numpyro.sample("beta0", fading if by_robot else dist.Beta(2.0, 2.0))
+        drift = most * (1.0 - jnp.exp(-2.0 * awareness[..., 1]))
+        with numpyro.plate("mission", len(drift)):
+            rates = ContactRate(drift, beta0, 0.1, 0.1)
+            numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    draws = learner_of(model, workspace).prior_draws(20, 0, workspace)
+    planner = Planner(workspace, *ENDS, **options)
+    if "max_failure" in options:
+        planner = planner.with_risk(np.random.default_rng(0).uniform(0.0, 0.1, (8, 4, 4)))
+    expected, plan = reference.plan(planner, draws), planner.plan(draws)
+    assert plan.exact
+    assert plan.value == pytest.approx(expected.value, rel=1e-9)
+    assert plan.value_band == pytest.approx(expected.value_band, rel=1e-9)
+    np.testing.assert_allclose(plan.bands, expected.bands, rtol=1e-9)
 
 
 @pytest.mark.parametrize("max_bounds", ["shortest", "shortest+2", 5])

@@ -332,11 +332,33 @@ class Planner(Summary):
         """Return the cells and bounds as a networkx graph.
 
         Nodes are the passable cells `(row, col)`, with the CRS coordinates `x` and `y` of their
-        centres in metres. Edges are the bounds, with their `length` in metres, the `drift` of the
-        team's mean trust and, given a risk, `risk` = -log(1 - p_fail). Let x be the limit of trust
-        if a bound is repeated. Then `cost` is -log sigma(x) plus the bound cost, and `lost` is the
-        contact lost at trust x, in bounds, plus the bound cost. If beta0 is 0, minus the sum of
-        `lost` along a path is the value of the path for lost_contact, without failures.
+        centres in metres. Edges are the bounds, with the attributes
+
+        - `length`: length in metres.
+        - `drift`: drift of the team's mean trust.
+        - `trust`: the team's stationary trust, the limit of trust if the bound is repeated.
+        - `lost`: contact lost at this trust, in bounds, plus the bound cost.
+        - `cost`: what the bound takes from the objective at this trust; see below.
+        - `risk`: -log(1 - p_fail), if the planner has a risk.
+
+        The algorithms of networkx minimise a sum over edges. If beta0 is 0, trust is not carried
+        over, and the sum of `cost` along a path to the goal gives its value:
+
+        - `lost_contact`: the value is minus the sum. With a risk, the cost of a bound includes
+          `failure_cost` times its failure probability, so the value is at least minus the sum.
+        - `terminal`: the value is sigma(c - sum), where c is `graph.graph["constant"]`. Only bounds
+          that enter the goal have another cost than the bound cost.
+        - `mean`: the value of a path of n bounds is c - sum / n. This is no sum, so `cost` orders
+          only paths with the same number of bounds.
+
+        For the first two objectives, `nx.shortest_path(graph, start, goal, weight="cost")` then has
+        the value of the plan, unless it has more than `max_bounds` bounds, or there is a risk. If
+        beta0 is not 0, it is a heuristic, because trust after a bound depends on the bounds before.
+        `planning.reference` plans with networkx in all cases. The costs for your own objectives are
+        those of `terminal` if trust counts at the goal only, and otherwise those of `mean`.
+
+        Costs are at least 0, as the algorithm of Dijkstra requires, unless a bound cost is
+        negative. Then use `nx.bellman_ford_path`, if no loop has a negative cost.
 
         Args:
             params: Posterior from `fit`, or parameters. Several draws are replaced by their mean.
@@ -361,19 +383,21 @@ class Planner(Summary):
         def of_bounds(values: np.ndarray) -> np.ndarray:
             return np.broadcast_to(values, bounds.shape)[bounds]
 
-        bound_cost = of_bounds(problem.bound_cost)
-        settled = of_bounds(recursion.steady_state())
+        trust = of_bounds(recursion.steady_state())
         rate = problem.likelihood.mean_rate(of_bounds(contact.steady_state()), recursion.noise_sd)
+        lost = of_bounds(problem.bound_cost) + np.maximum(1.0 - rate, 0.0)  # without rounding
+        cost, constant = problem.costs_of_bounds(trust, lost)
         values = {
             "length": of_bounds(length[:, None, None]),
             "drift": of_bounds(recursion.drift.mean(0)),
-            "cost": bound_cost + np.logaddexp(0.0, -settled),
-            "lost": bound_cost + 1.0 - rate,
+            "trust": trust,
+            "lost": lost,
+            "cost": cost,
         }
         if problem.risk is not None:
             values["risk"] = of_bounds(risk_of(problem.risk.p_fail))
 
-        graph = nx.DiGraph()
+        graph = nx.DiGraph(constant=constant)
         for row, col in np.argwhere(self.workspace.passable.values).tolist():
             graph.add_node((row, col), x=float(grid.x[col]), y=float(grid.y[row]))
         for k, (move, row, col) in enumerate(np.argwhere(bounds).tolist()):

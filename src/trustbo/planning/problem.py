@@ -121,6 +121,38 @@ class Problem:
             return 0.0
         return self.price * self.risk.priced(path)
 
+    def costs_of_bounds(self, trust: np.ndarray, lost: np.ndarray) -> tuple[np.ndarray, float]:
+        """Compute the costs of all bounds as if trust were not carried over; see `Planner.graph`.
+
+        Args:
+            trust: The team's trust after each bound of `paths.bounds`, shape (bound,).
+            lost: Contact lost in each bound plus the bound cost, shape (bound,).
+
+        Returns:
+            Costs (bound,), which are not negative unless a bound cost is, and a constant c. The
+            score of a path is c - (sum of costs), or c - (sum of costs) / n if it is the mean over
+            n bounds.
+        """
+        bounds = self.paths.bounds
+        if self.objective.of_contact:
+            if self.risk is None:
+                return lost, 0.0
+            return lost + self.price * np.nan_to_num(self.risk.p_fail[bounds]), 0.0
+
+        bound_cost = self.bound_cost[bounds]
+        credit = self.objective.credit(np.arange(self.paths.longest + 1))
+        if credit[1:].any():
+            cost = bound_cost - trust
+            constant = float(np.max(-cost, initial=0.0))
+            return cost + constant, constant
+
+        # Trust counts at the goal only. The constant makes the costs of the last bounds positive.
+        enters_goal = np.zeros(bounds.shape, bool)
+        enters_goal[:, *self.paths.goal] = True
+        is_last = enters_goal[bounds]
+        constant = float(credit[0] * trust[is_last].max())
+        return bound_cost + np.where(is_last, constant - credit[0] * trust, 0.0), constant
+
     def is_within_limit(self, path: Sequence[Cell] | np.ndarray) -> bool:
         """Return whether a path respects `max_failure`."""
         if self.max_failure is None or self.risk is None:

@@ -1,52 +1,79 @@
 """Reference planner, based on networkx and enumeration, for testing the compiled searches.
 
-If the value of a path is a sum over its bounds, the Bellman-Ford algorithm finds the best path in
-the unrolled graph. If the value depends on history or risk, all admissible paths are enumerated.
-Neither method uses the compiled kernels.
+It covers everything that `Planner.plan` does: all objectives, families, models, costs, risks and
+limits. If the score of a path is a sum over its bounds, the Bellman-Ford algorithm of networkx
+finds the best path in the unrolled graph, whose nodes consist of a cell and the number of bounds
+left. If the score is a nonlinear function of trust, or depends on a risk, all admissible paths are
+enumerated, which is feasible for small grids. Neither method uses the compiled kernels.
 """
 
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import cast
 
 import networkx as nx
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.models.params import Params
+from trustbo.hazard.risk import Risk
+from trustbo.models.draws import Draws
 from trustbo.planning.objectives import capped, has_history
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
-from trustbo.planning.problem import mean_of
-from trustbo.planning.recursion import Recursion
+from trustbo.planning.problem import InfeasibleError, Problem, mean_and_draws_of, risk_of
+from trustbo.planning.recursion import Recursion, states_along
 from trustbo.workspace.moves import MOVES
 
 
-def plan(planner: Planner, params: Params | xr.DataTree) -> Plan:
+def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
     """Find the best admissible path for given parameters, or for the mean of a posterior.
 
-    The value equals that of `planner.plan(params)`. The paths may differ if several are optimal.
+    The value equals that of `planner.plan(params, x0=x0)`. The paths may differ if several are
+    optimal.
 
     Args:
-        planner: Planner for a small grid.
-        params: Posterior from `fit`, or parameters. Several draws are replaced by their mean.
+        planner: Planner; for a small grid if all paths have to be enumerated.
+        params: Posterior from `fit`, or parameters; see `Planner.plan`.
+        x0: Expected trust at the start; by default `params.x0_mean`.
 
     Raises:
         InfeasibleError: If no path respects `max_failure`.
+
+    Example:
+        >>> planner = tb.planning.Planner(workspace, (3, 0), (0, 3), family="censored")
+        >>> tb.planning.reference.plan(planner, posterior).value  # that of planner.plan(posterior)
     """
+    started = time.perf_counter()
     problem = planner.problem
-    mean = mean_of(params, planner.workspace)
+    mean, draws = mean_and_draws_of(params, planner.workspace)
+    recursion = capped(problem.objective, problem.likelihood, problem.recursion(mean, x0))
 
     if problem.risks is not None or has_history(problem.objective, problem.likelihood):
-        plans = [planner.evaluate(path, mean) for path in every_path(problem.paths)]
-        feasible = [one for one in plans if not one.infeasible]
-        if not feasible:
-            return planner.plan(mean)  # raises InfeasibleError
-        return max(feasible, key=lambda one: one.value)
+        paths = every_path(problem.paths)
+    else:
+        paths = shortest_paths(planner, recursion)
 
-    recursion = capped(problem.objective, problem.likelihood, problem.recursion(mean))
-    plans = [planner.evaluate(path, mean) for path in shortest_paths(planner, recursion)]
-    return max(plans, key=lambda one: one.value)
+    best = None
+    best_value = -np.inf
+    for path in paths:
+        if not problem.is_within_limit(path):
+            continue
+        value = _value_of(problem, recursion, path)
+        if best is None or value > best_value:
+            best = path
+            best_value = value
+    if best is None:
+        raise _infeasible(problem, cast("Risk", problem.risk))  # without a risk, no path is refused
+
+    found = planner.evaluate(best, mean, x0=x0)
+    if draws is not None:
+        found = found.with_draws(planner.evaluate(best, params, x0=x0))
+    seconds = time.perf_counter() - started
+    return replace(found, exact=True, limit=found.value, seconds=seconds)
 
 
 def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cell, ...]]:
@@ -74,6 +101,19 @@ def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cel
         bound_cost[b] - weights[j] @ drift[:, b]
         for b, j in zip(graph.bound, n_bounds_left, strict=True)
     ]
+    return cheapest_paths(problem.paths, cost)
+
+
+def cheapest_paths(
+    paths: AdmissiblePaths, cost: Sequence[float] | np.ndarray
+) -> Iterator[tuple[Cell, ...]]:
+    """Find the path of least cost for each number of bounds.
+
+    Args:
+        paths: Admissible paths.
+        cost: Cost of each edge of the unrolled graph `paths.graph`, shape (edge,).
+    """
+    graph = paths.graph
     network = graph.to_networkx(cost)
 
     for s in graph.starts:
@@ -84,7 +124,30 @@ def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cel
             continue
 
         cells = np.array([node[1] for node in nodes[:-1]])
-        yield (*problem.paths.cells(cells), planner.goal)
+        yield (*paths.cells(cells), paths.goal)
+
+
+def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Cell]) -> float:
+    """Compute the value of a path, with the expected cost of failure."""
+    along = recursion.along(path)
+    trust = states_along(along).mean(-1)
+    value = problem.value_along(path, trust, along.noise_sd)
+    return float(value) - problem.failure_along(path)
+
+
+def _infeasible(problem: Problem, risk: Risk) -> InfeasibleError:
+    """Return an error that says that no path respects `max_failure`, with the safest path."""
+    of_bounds = risk_of(risk.p_fail).ravel()
+    paths = cheapest_paths(problem.paths, of_bounds[problem.paths.graph.bound])
+
+    safest = max(paths, key=risk.survival)
+    p_fail = 1.0 - risk.survival(safest)
+    return InfeasibleError(
+        f"no admissible path has a failure probability of at most max_failure = "
+        f"{problem.max_failure:g}. The smallest is {p_fail:.4g}.",
+        safest,
+        p_fail,
+    )
 
 
 def every_path(paths: AdmissiblePaths) -> Iterator[tuple[Cell, ...]]:
