@@ -152,7 +152,7 @@ def _bounds_of(workspace: Workspace, cell: Location | None, move: str | None) ->
 
     if cell is None:
         which = np.argwhere(exists)
-        target = np.ravel_multi_index(tuple(which[:, 1:].T), exists.shape[1:])
+        target = which[:, 1] * exists.shape[2] + which[:, 2]  # flat index of the cell
         n_targets = exists[0].size
     else:
         row, col = workspace.locate(cell, "cell")
