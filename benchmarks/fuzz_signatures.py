@@ -453,6 +453,7 @@ def of_planning() -> list[Call]:
     some = {"posterior": draws(), "n_draws": 5, "seed": 0}
     along_path = {"params": PARAMS, "awareness": mission().awareness, "x0": start}
     avoided = {"bounds": np.zeros((8, 4, 4), bool), "risk": p_fail}
+    place = {"robot": "r2", "cell": (2, 1), "move": "n"}
     p = planner()
     return [
         Call("planning.Planner", tb.planning.Planner, made),
@@ -462,6 +463,8 @@ def of_planning() -> list[Call]:
         Call("planning.Planner.evaluate", p.evaluate, {"path": PATH, "params": draws()}),
         Call("planning.Planner.maps", p.maps, some),
         Call("planning.Planner.trust_map", p.trust_map, {"params": PARAMS, "x0": start}),
+        Call("planning.Planner.trust", p.trust, {"params": draws(), **place}),
+        Call("planning.Planner.robot_maps", p.robot_maps, {"posterior": draws()}),
         Call("planning.Planner.graph", p.graph, {"params": PARAMS}),
         Call("planning.Planner.with_risk", at_risk, {"p_fail": p_fail, "draws": p_fail[None]}),
         Call("planning.Planner.with_failure_cost", at_cost, {"failure_cost": 1.0}),
@@ -564,6 +567,7 @@ def of_campaign() -> list[Call]:
         Call("Campaign.exclude", campaign(1).exclude, {"n": 1, "reason": "rain"}),
         Call("Campaign.run", lambda **given: list(campaign().run(**given)), run),
         Call("Campaign.maps", r.maps, {"n_draws": 5}),
+        Call("Campaign.trust", r.trust, {"robot": "r2", "cell": (2, 1), "move": "n"}),
         Call("Campaign.draw_prior", r.draw_prior, {"n_draws": 5}),
         Call("iterate", tb.iterate, iterated),
         Call("RegretBound", tb.RegretBound, {"eps": 0.05, "delta": 0.1}),
