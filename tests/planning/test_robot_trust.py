@@ -206,3 +206,10 @@ def test_unknown_robots_moves_and_places_are_refused(workspace, what, wrong):
     draws = sample_prior(PooledTrust(), 2, 2, 0)
     with pytest.raises(TrustboError, match=what):
         Planner(workspace, *ENDS).trust(draws, **wrong)
+
+
+def test_a_move_that_enters_no_cell_is_refused():
+    row = tb.Workspace.from_awareness(np.full((1, 1, 4, 2), 0.5))
+    draws = sample_prior(PooledTrust(), 2, 2, 0)
+    with pytest.raises(TrustboError, match="no bound enters any cell"):
+        Planner(row, (0, 0), (0, 3)).trust(draws, move="n")

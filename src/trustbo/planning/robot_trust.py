@@ -15,7 +15,7 @@ import xarray as xr
 from trustbo.errors import TrustboError, require_choice, warn
 from trustbo.models.draws import Draws
 from trustbo.models.families import Family
-from trustbo.planning.recursion import Recursion, trust_recursion
+from trustbo.planning.recursion import trust_recursion
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVE_NAMES
@@ -71,8 +71,11 @@ def robot_trust(
 
     chosen = list(names) if robot is None else [robot]
     index = [names.index(name) for name in chosen]
-    parts = _means(bounds, family, draws)
-    values = np.concatenate([(rate if as_rate else trust)[:, index] for trust, rate in parts])
+    means = []
+    for part, trust in _stationary(bounds, draws):
+        of_bounds = _rate_of(trust, family, part) if as_rate else trust
+        means.append(bounds.mean(of_bounds)[:, index])
+    values = np.concatenate(means)
     _warn_of_draws(np.isnan(values).all((1, 2)))
 
     like = workspace.passable
@@ -107,7 +110,10 @@ def robot_maps(workspace: Workspace, family: Family, draws: Draws) -> xr.Dataset
     diverging = []
 
     # Sums of deviations from the first draw keep one map per robot in memory, and do not cancel.
-    for trust, rate in _means(bounds, family, draws):
+    for part, of_bounds in _stationary(bounds, draws):
+        trust = bounds.mean(of_bounds)
+        rate = bounds.mean(_rate_of(of_bounds, family, part))
+
         is_diverging = np.isnan(trust).all((1, 2))
         diverging.append(is_diverging)
         kept = trust[~is_diverging]
@@ -150,25 +156,34 @@ def _bounds_of(workspace: Workspace, cell: Location | None, move: str | None) ->
         is_move = np.array(MOVE_NAMES) == move
         exists = exists & is_move[:, None, None]
 
+    entered = "any cell"
+    if cell is not None:
+        row, col = workspace.locate(cell, "cell")
+        entered = f"the cell {(row, col)}"
+        is_entered = np.zeros(exists.shape[1:], bool)
+        is_entered[row, col] = True
+        exists = exists & is_entered
+
+    which = np.argwhere(exists)
+    if not len(which):
+        by = "" if move is None else f" by the move {move!r}"
+        raise TrustboError(f"no bound enters {entered}{by}.")
+
+    target = np.zeros(len(which), int)
+    n_targets = 1
     if cell is None:
-        which = np.argwhere(exists)
         target = which[:, 1] * exists.shape[2] + which[:, 2]  # flat index of the cell
         n_targets = exists[0].size
-    else:
-        row, col = workspace.locate(cell, "cell")
-        which = np.array([(m, row, col) for m in np.flatnonzero(exists[:, row, col])])
-        if not len(which):
-            by = "" if move is None else f" by the move {move!r}"
-            raise TrustboError(f"no bound enters the cell {(row, col)}{by}.")
-        target = np.zeros(len(which), int)
-        n_targets = 1
 
     awareness = workspace.awareness.values[:, *which.T]
     return Bounds(workspace, which, awareness, target, n_targets)
 
 
-def _means(bounds: Bounds, family: Family, draws: Draws) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the mean trust and rate (draw, robot, place) over bounds, some draws at a time."""
+def _stationary(bounds: Bounds, draws: Draws) -> Iterator[tuple[Draws, np.ndarray]]:
+    """Yield some draws at a time, and the stationary trust (draw, robot, bound) under these draws.
+
+    Trust is NaN for draws in which it diverges.
+    """
     grid = bounds.workspace.grid.shape
     if draws.grid_shape not in (None, grid):
         raise TrustboError(
@@ -182,17 +197,11 @@ def _means(bounds: Bounds, family: Family, draws: Draws) -> Iterator[tuple[np.nd
     for first in range(0, n_draws, size):
         part = flat.draw(np.arange(first, min(first + size, n_draws)))
         recursion = trust_recursion(part, bounds.awareness, bounds=bounds.which, by_robot=True)
-        trust = _stationary(recursion)
-        yield bounds.mean(trust), bounds.mean(_rate_of(trust, family, part))
 
-
-def _stationary(recursion: Recursion) -> np.ndarray:
-    """Compute the limit (draw, robot, bound) of trust; NaN for draws in which it diverges."""
-    radius = np.abs(np.linalg.eigvals(recursion.transition)).max(-1)
-    diverges = radius >= 1.0
-    transition = np.where(diverges[:, None, None], 0.0, recursion.transition)
-    limit = recursion._replace(transition=transition).steady_states()
-    return np.where(diverges[:, None, None], np.nan, limit)
+        radius = np.abs(np.linalg.eigvals(recursion.transition)).max(-1)
+        diverges = (radius >= 1.0)[:, None, None]
+        recursion = recursion._replace(transition=np.where(diverges, 0.0, recursion.transition))
+        yield part, np.where(diverges, np.nan, recursion.steady_states())
 
 
 def _rate_of(trust: np.ndarray, family: Family, draws: Draws) -> np.ndarray:
