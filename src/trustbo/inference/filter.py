@@ -16,7 +16,6 @@ from trustbo.inference.learner import params_of
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import NO_TICKS
-from trustbo.models.params import ParameterDraws, check_params
 from trustbo.parallel import computing
 from trustbo.statespace import Inputs, kalman
 from trustbo.workspace import Workspace
@@ -127,8 +126,7 @@ class TrustFilter:
             raise TrustboError("TrustParams do not contain the number of robots; give n_robots.")
         self._n_robots = require_whole("n_robots", n_robots, 1)
         self._n_features = posterior.n_features
-        if isinstance(posterior, ParameterDraws):
-            check_params(posterior, self._n_robots, posterior.n_features)  # pyright: ignore[reportArgumentType]
+        posterior.require_valid(self._n_robots, self._n_features)
 
         flat = posterior.flat()
         [n_draws] = flat.leading

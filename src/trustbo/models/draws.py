@@ -51,6 +51,10 @@ class Draws(ABC):
         """Whether the inputs of a bound are carried over to later bounds (see `statespace`)."""
 
     @abstractmethod
+    def require_valid(self, n_robots: int | None = None, n_features: int | None = None) -> None:
+        """Raise TrustboError if a value cannot be used, or these numbers are given and differ."""
+
+    @abstractmethod
     def state_space(self, n_robots: int, *, adds_noise: bool = True) -> StateSpace:
         """Return the model's equation at each draw, with leading axes joined to one axis.
 

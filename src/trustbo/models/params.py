@@ -115,6 +115,14 @@ class ParameterDraws(Summary, Draws):
             return effect.shape[-2:]
         return None
 
+    def require_valid(self, n_robots: int | None = None, n_features: int | None = None) -> None:
+        """See `Draws.require_valid`."""
+        params: Any = self
+        require_values(params)
+        if n_features is not None:
+            require_shapes(params, n_robots, n_features)
+        require_covariances(params)
+
     def inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
         """Compute the input u = sum_m beta_m z_m + b of bounds, with any place effects.
 
@@ -124,7 +132,7 @@ class ParameterDraws(Summary, Draws):
             TrustboError: If the number of robots, features or cells does not match the parameters.
         """
         n_robots = None if self.places else len(awareness)
-        check_params(self, n_robots, awareness.shape[-1])  # pyright: ignore[reportArgumentType]
+        require_shapes(self, n_robots, awareness.shape[-1])  # pyright: ignore[reportArgumentType]
         u = self.increments(awareness)
 
         axes = awareness.ndim - 2  # of bounds
@@ -347,15 +355,24 @@ def require_values(params: Params) -> None:
         require_numbers(f"params.{field}", value, missing=field in PLACES)
 
 
-def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
-    """Check that the shapes of parameters match `n_features` and, unless None, `n_robots`.
+def require_covariances(params: Params) -> None:
+    """Raise TrustboError for a covariance that is not symmetric and positive definite."""
+    for field in params.by_name:
+        if not field.startswith("Delta"):
+            continue
 
-    Raises TrustboError if a value is not a number, infinite or beyond 1e12, the number of robots or
-    features differs, or a covariance is not symmetric and positive definite.
-    """
+        value = np.asarray(getattr(params, field))
+        same = np.allclose(value, np.swapaxes(value, -1, -2), rtol=1e-8, atol=1e-12)
+        if not (same and np.linalg.eigvalsh(value).min() > 0.0):
+            raise TrustboError(
+                f"params.{field} must be symmetric and positive definite; got {value!r}."
+            )
+
+
+def require_shapes(params: Params, n_robots: int | None, n_features: int) -> None:
+    """Raise TrustboError unless shapes match `n_features` and, unless None, `n_robots`."""
     n = params.n_robots if n_robots is None else n_robots
     sizes = {"feature": {n_features}, "robot": {n}, "robot_": {n}, "effect": {1, n}}
-    require_values(params)
 
     for field, axes in params.AXES.items():
         if getattr(params, field) is None:
@@ -369,13 +386,6 @@ def check_params(params: Params, n_robots: int | None, n_features: int) -> None:
                 f"params.{field} must end in the axes {axes}, with {n_features} features "
                 f"and {n or 'any number of'} robots; got the shape {value.shape}."
             )
-
-        if field.startswith("Delta"):
-            same = np.allclose(value, np.swapaxes(value, -1, -2), rtol=1e-8, atol=1e-12)
-            if not (same and np.linalg.eigvalsh(value).min() > 0.0):
-                raise TrustboError(
-                    f"params.{field} must be symmetric and positive definite; got {value!r}."
-                )
 
 
 def _written(draws: np.ndarray) -> str:

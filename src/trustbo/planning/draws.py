@@ -85,7 +85,8 @@ class DrawnPaths:
         """Compute the value of a path for each draw of `recursion`, shape (draw,)."""
         problem = self.problem
         along = capped(problem.objective, problem.likelihood, recursion.along(path))
-        value = problem.value_along(path, states_along(along).mean(-1), along.noise_sd)
+        trust = states_along(along).mean(-1)
+        value = problem.value_along(problem.bound_cost_along(path), trust, along.noise_sd)
         return value - problem.failure_along(path)
 
     @cached_property

@@ -585,15 +585,15 @@ def _value_along(
     by_robot = trust_recursion(params, z, x0, bounds=bounds, by_robot=True)
     trust = states_along(by_robot)
     trust = trust.reshape(-1, *trust.shape[-2:])
-    values = np.atleast_1d(problem.value_along(cells, trust.mean(-1), by_robot.noise_sd))
+    bound_cost = problem.bound_cost_along(cells)
+    values = np.atleast_1d(problem.value_along(bound_cost, trust.mean(-1), by_robot.noise_sd))
     if not problem.objective.of_contact:
-        value = problem.value_along(cells, trust.mean((0, -1)), by_robot.noise_sd)
+        value = problem.value_along(bound_cost, trust.mean((0, -1)), by_robot.noise_sd)
         return trust, float(value), values
 
     # Capping the trust of each draw causes bias, so the value of each draw uses uncapped trust.
     # However, the contact lost on a path cannot be negative.
-    team = capped(
-        problem.objective, problem.likelihood, trust_recursion(params, z, x0, bounds=bounds)
-    )
-    mean = problem.value_along(cells, states_along(team).mean(-1), team.noise_sd).mean()
-    return trust, float(mean), np.minimum(values, -problem.bound_cost_along(cells))
+    team = by_robot if params.by_robot else by_robot.of_team()
+    team = capped(problem.objective, problem.likelihood, team)
+    mean = problem.value_along(bound_cost, states_along(team).mean(-1), team.noise_sd).mean()
+    return trust, float(mean), np.minimum(values, -bound_cost)

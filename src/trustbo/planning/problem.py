@@ -16,7 +16,6 @@ from trustbo.hazard.risk import ROUNDING, Risk
 from trustbo.inference.learner import expected_and_drawn, params_of
 from trustbo.models.draws import Draws
 from trustbo.models.families import Family
-from trustbo.models.params import ParameterDraws, require_values
 from trustbo.planning.labels import LOGISTIC, LOSSES, TINY_SD, Costs, best_labels
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
 from trustbo.planning.paths import AdmissiblePaths
@@ -97,15 +96,13 @@ class Problem:
         """Sum the costs of the bounds of a path."""
         return float(self.bound_cost[*bounds_along(path).T].sum())
 
-    def value_along(
-        self, path: Sequence[Cell] | np.ndarray, trust: np.ndarray, noise_sd: np.ndarray
-    ) -> np.ndarray:
+    def value_along(self, bound_cost: float, trust: np.ndarray, noise_sd: np.ndarray) -> np.ndarray:
         """Compute the value of a path, shape (...,), assuming that no bound fails.
 
-        The team's `trust` after each bound has shape (..., bound), and `noise_sd` has shape (...,).
+        `bound_cost` is the sum over the path. The team's `trust` after each bound has shape (...,
+        bound), and `noise_sd` has shape (...,).
         """
         objective = self.objective
-        bound_cost = self.bound_cost_along(path)
         if objective.of_contact:
             lost = 1.0 - self.likelihood.mean_rate(trust, noise_sd[..., None])
             return objective.value(-lost.sum(-1) - bound_cost)
@@ -336,9 +333,10 @@ def draws_of(
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior, workspace, next_mission=next_mission)
 
-    draws = require_kind("posterior", posterior, Draws, "give a posterior from fit, or parameters")
-    if isinstance(draws, ParameterDraws):
-        require_values(draws)  # pyright: ignore[reportArgumentType]
+    draws: Draws = require_kind(
+        "posterior", posterior, Draws, "give a posterior from fit, or parameters"
+    )
+    draws.require_valid()
     return draws.flat() if len(draws.leading) > 1 else draws
 
 

@@ -10,7 +10,6 @@ from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind
 from trustbo.models.draws import Draws
-from trustbo.models.params import ParameterDraws, require_values
 from trustbo.statespace import kalman
 from trustbo.workspace.moves import bounds_along
 
@@ -30,6 +29,15 @@ class Recursion(NamedTuple):
     drift: np.ndarray
     start: np.ndarray
     noise_sd: np.ndarray
+
+    def of_team(self) -> "Recursion":
+        """Return the recursion of the mean trust of robots that obey the same equation."""
+        axis = self.start.ndim - 1  # of the states
+        return self._replace(
+            transition=self.transition[..., :1, :1],
+            drift=self.drift.mean(axis, keepdims=True),
+            start=self.start.mean(-1, keepdims=True),
+        )
 
     def flat(self) -> "Recursion":
         """Return the recursion with a leading axis (draw,), of length 1 for a single draw."""
@@ -137,8 +145,7 @@ def expected_trust(
             has another length, or there are place effects and no path is given.
     """
     require_kind("params", params, Draws, "give parameters, such as TrustParams(...)")
-    if isinstance(params, ParameterDraws):
-        require_values(params)  # pyright: ignore[reportArgumentType]
+    params.require_valid()
 
     dims = ("bound", "robot", "feature")
     unnamed = {"robot": None, "feature": None}

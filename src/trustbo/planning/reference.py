@@ -131,7 +131,7 @@ def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Cell]) -> f
     """Compute the value of a path, with the expected cost of failure."""
     along = recursion.along(path)
     trust = states_along(along).mean(-1)
-    value = problem.value_along(path, trust, along.noise_sd)
+    value = problem.value_along(problem.bound_cost_along(path), trust, along.noise_sd)
     return float(value) - problem.failure_along(path)
 
 

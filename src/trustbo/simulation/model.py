@@ -11,7 +11,6 @@ from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.models import PooledTrust
 from trustbo.models.draws import Draws
 from trustbo.models.model import TrustModel
-from trustbo.models.params import ParameterDraws, check_params
 from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.statespace import kalman
 from trustbo.streams import stream
@@ -71,8 +70,7 @@ class ModelSimulator(DescribedSimulator):
 
         if params.leading:
             raise TrustboError(f"params must be a single draw; got leading axes {params.leading}.")
-        if isinstance(params, ParameterDraws):
-            check_params(params, shape[0], shape[-1])  # pyright: ignore[reportArgumentType]
+        params.require_valid(shape[0], shape[-1])
 
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
         if (self.n_ticks is not None) != self.model.likelihood.needs_ticks:

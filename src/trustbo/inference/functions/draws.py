@@ -125,10 +125,18 @@ class FunctionDraws(Draws):
             self._form = space
         return self._form
 
+    def require_valid(self, n_robots: int | None = None, n_features: int | None = None) -> None:
+        """See `Draws.require_valid`; values of a posterior are valid."""
+        for what, given, own in (
+            ("robots", n_robots, self.n_robots),
+            ("features", n_features, self.n_features),
+        ):
+            if given not in (None, own):
+                raise TrustboError(f"the draws are of {own} {what}, not {given}.")
+
     def state_space(self, n_robots: int, *, adds_noise: bool = True) -> StateSpace:
         """See `Draws.state_space`."""
-        if n_robots != self.n_robots:
-            raise TrustboError(f"the draws are of {self.n_robots} robots, not {n_robots}.")
+        self.require_valid(n_robots)
         return self._space
 
     def inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
