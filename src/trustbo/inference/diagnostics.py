@@ -34,7 +34,7 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
 
 
 def complaints_of(
-    draws: Mapping[str, np.ndarray], diverging: np.ndarray
+    draws: Mapping[str, np.ndarray], diverging: np.ndarray, most_divergences: int = 0
 ) -> tuple[dict[str, float], list[str]]:
     """Compute the NUTS diagnostics of draws (chain, draw, ...), and list the failed checks."""
     flat = {name: values.reshape(*values.shape[:2], -1) for name, values in draws.items()}
@@ -55,6 +55,6 @@ def complaints_of(
         complaints.append(f"R-hat is {worst:.3f} (limit {MAX_RHAT})")
     if not least >= MIN_ESS:
         complaints.append(f"bulk ESS is {least:.0f} (minimum {MIN_ESS:.0f})")
-    if divergences:
-        complaints.append(f"{divergences} transitions diverged (limit 0)")
+    if divergences > most_divergences:
+        complaints.append(f"{divergences} transitions diverged (limit {most_divergences})")
     return dict(zip(NUTS_NAMES, (worst, least, divergences), strict=True)), complaints

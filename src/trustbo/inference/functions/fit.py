@@ -53,7 +53,9 @@ _LAST_ACCEPT = 0.99
 _ATTEMPTS = 4
 """Runs of NUTS after which bad diagnostics are reported, if each has many draws."""
 _PATIENT = 2
-"""Runs after which the chains of the drift count instead of those of the variables."""
+"""Runs after which the chains of the drift may count instead of those of the variables."""
+_TOLERATED = 0.005
+"""Share of divergent transitions that is then accepted with a warning."""
 _CHECKED = 100
 """Most measured bounds whose drift is checked."""
 _MANY = 4000
@@ -130,6 +132,13 @@ def fit_function(
         **{f"{name}_version": version for name, version in VERSIONS.items()},
     }
 
+    n_diverged = int(verdict.diagnostics["divergences"])
+    if n_diverged and not verdict.complaints:
+        warn(
+            f"{n_diverged} of {stats['diverging'].size} transitions diverged, even with small "
+            f"steps: draws of {model.in_short()} may miss narrow parts of the posterior. Narrower "
+            "priors or another parametrisation help."
+        )
     if verdict.not_identified:
         warn(
             f"the chains of {joined_names(verdict.not_identified)} differ, but those of "
@@ -315,15 +324,16 @@ class Verdict(NamedTuple):
     """Variables whose chains differ, although those of the drift and the noises agree."""
 
 
-def _judge(model: FunctionModel, data: Data, samples: Samples, *, by_drift: bool) -> Verdict:
-    """Check samples: the chains of the variables or, with `by_drift`, of what plans depend on.
+def _judge(model: FunctionModel, data: Data, samples: Samples, *, patient: bool) -> Verdict:
+    """Check the chains of the variables or, if they are bad and `patient`, of what plans depend on.
 
     Variables may differ between chains although the drift does not, such as the weights of a neural
-    network, whose units can be exchanged.
+    network, whose units can be exchanged. With `patient`, a few divergences are accepted, too.
     """
     diverging = samples.fields["diverging"]
-    found, complaints = complaints_of(samples.z, diverging)
-    if not complaints or not by_drift:
+    most = int(_TOLERATED * diverging.size) if patient else 0
+    found, complaints = complaints_of(samples.z, diverging, most)
+    if not complaints or not patient:
         return Verdict(found, complaints, [])
 
     shape = diverging.shape
@@ -336,11 +346,11 @@ def _judge(model: FunctionModel, data: Data, samples: Samples, *, by_drift: bool
 
     used = {"drift": u} | {n: v for n, v in space._asdict().items() if v is not None}
     by_chain = {name: v.reshape(*shape, -1) for name, v in used.items()}
-    found_of_drift, complaints_of_drift = complaints_of(by_chain, diverging)
+    found_of_drift, complaints_of_drift = complaints_of(by_chain, diverging, most)
     if complaints_of_drift:
         return Verdict(found, complaints, [])
 
-    alone = {name: complaints_of({name: v}, diverging)[1] for name, v in samples.z.items()}
+    alone = {name: complaints_of({name: v}, diverging, most)[1] for name, v in samples.z.items()}
     return Verdict(found_of_drift, [], [name for name, failed in alone.items() if failed])
 
 
@@ -359,7 +369,8 @@ def _sampled(
 
     Each run starts from draws of the run before. Draws of runs without divergent transitions are
     joined, and as many as were asked for are kept, evenly spaced, or all if those are too few.
-    After a divergence, earlier draws are discarded, and steps are smaller.
+    After a divergence, earlier draws are discarded, and steps are smaller. From the second run on,
+    a few divergences are accepted, and variables that are not identified; see `_judge`.
 
     Returns:
         Samples, and the verdict on them.
@@ -380,19 +391,22 @@ def _sampled(
             seed=int(np.random.SeedSequence([seed, attempt]).generate_state(1)[0]),
             progress=progress,
         )
-        if last.fields["diverging"].any():
+        attempt += 1
+        patient = attempt >= _PATIENT
+        share = last.fields["diverging"].mean()
+        is_bad = share > (_TOLERATED if patient else 0.0)
+        if is_bad:
             runs = []
             accept = _LAST_ACCEPT
 
-        attempt += 1
         joined = joined_samples([*runs, last])
-        verdict = _judge(model, data, joined, by_drift=attempt >= _PATIENT)
+        verdict = _judge(model, data, joined, patient=patient)
         if not verdict.complaints or attempt == most:
             few = joined.some(draws)
-            of_few = _judge(model, data, few, by_drift=bool(verdict.not_identified))
+            of_few = _judge(model, data, few, patient=patient)
             return (joined, verdict) if of_few.complaints else (few, of_few)
 
-        if not last.fields["diverging"].any():
+        if not is_bad:
             runs.append(last)
         x = coordinates_of(last.z)
         start = warm_start(x, last.step_size, len(start.x), seed + attempt)

@@ -33,6 +33,8 @@ _MOST_DENSE = 50
 """Most coordinates for which the mass matrix is dense."""
 _RIDGE = 1e-3
 """Share of the variances that is added to the covariance of a previous posterior."""
+_DEPTH = 7
+"""Most doublings of a trajectory, after which it has 127 steps."""
 _FIELDS = ("num_steps", "diverging", "accept_prob", "energy", "potential_energy")
 
 
@@ -161,6 +163,7 @@ class Sampler:
                 inverse_mass_matrix=mass,
                 dense_mass=n <= _MOST_DENSE,
                 target_accept_prob=accept,
+                max_tree_depth=_DEPTH,
                 model_args=(arrays,),
                 rng_key=key,
             )
