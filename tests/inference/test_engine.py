@@ -5,63 +5,63 @@ import sys
 import jax
 import numpy as np
 import pytest
-from joint_normal import Dense
+from dense_coefficients import DenseRates
+from dense_families import with_one_limit
+from every_model import FEATURES, models_of, observed
 from numpyro import handlers
 
 from trustbo.inference import engine, factor
 from trustbo.inference.density import Density, at
-from trustbo.models import (
-    CoupledTrust,
-    HierarchicalTrust,
-    PlaceEffect,
-    PooledTrust,
-    RobotEffect,
-)
 from trustbo.models.backend import own_settings
-from trustbo.models.observations import Observations
-from trustbo.models.visited import visited
 
-FEATURES = ("line_of_sight", "vegetation")
-EFFECTS = (PlaceEffect(), RobotEffect())
-MODELS = {
-    "pooled": PooledTrust(),
-    "places and robots": PooledTrust(effects=EFFECTS),
-    "deviation": PooledTrust(effects=(RobotEffect(),), memory="deviation"),
-    "shared noise": PooledTrust(effects=EFFECTS, shared_noise=True),
-    "hierarchical": HierarchicalTrust(effects=(RobotEffect(),)),
-    "hierarchical, shared noise": HierarchicalTrust(shared_noise=True),
-    "coupled": CoupledTrust(),
-    "coupled, places and robots": CoupledTrust(effects=EFFECTS),
-}
+GAUSSIAN = models_of("gaussian")
+CENSORED = models_of("censored")
+EVERYTHING = "places and robots"
+LEAST = 1e-4  # the least sd of an effect that the models take
 
 
-def slots_of(model, *, gaps=False, shape=(4, 5, 3)):
-    rng = np.random.default_rng(0)
-    z, y = rng.uniform(size=(*shape, 2)), rng.uniform(size=shape)
-    if gaps:
-        y[rng.random(shape) < 0.15] = np.nan
-        y[1, 3:] = np.nan
-    observations = Observations(y, z, np.full(shape, 50.0), FEATURES)
-    if PlaceEffect() not in model.effects:
-        return observations
-    steps = [rng.integers(0, n, shape[:2]) for n in (8, 4, 4)]
-    return observations._replace(visited=visited(np.stack(steps, -1), (4, 4)))
+def posterior_of(model, *, change=None, **options):
+    """Density of a model, three thetas, and the dense reference of a given theta."""
+    model = model.for_features(FEATURES)
+    with_places = any(effect.group == "places" for effect in model.effects)
+    observations, bounds = observed(with_places=with_places, **options)
+    if change is not None:
+        observations = change(observations)
 
-
-def posterior_of(name, **options):
-    model = MODELS[name].for_features(FEATURES)
-    posterior = Density(model, slots_of(model, **options))
+    posterior = Density(model, observations)
     z = 0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores))
-    return posterior, posterior.theta(z)
+    return posterior, posterior.theta(z), lambda at: DenseRates(model, observations, at, bounds)
 
 
 @pytest.mark.parametrize("gaps", [False, True])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", GAUSSIAN)
 def test_the_evidence_is_the_density_of_the_dense_joint_normal(name, gaps):
-    posterior, theta = posterior_of(name, gaps=gaps)
-    for i, value in enumerate(posterior.log_evidence(theta)):
-        dense = Dense(posterior.model, posterior.observations, at(theta, slice(i, i + 1)))
-        np.testing.assert_allclose(value, dense.log_density(), rtol=1e-9)
+    posterior, theta, dense = posterior_of(GAUSSIAN[name], gaps=gaps)
+    expected = dense(theta).log_density()
+    np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", CENSORED)
+def test_the_evidence_of_censored_rates_inside_the_limits_is_that_of_gaussian_ones(name):
+    posterior, theta, dense = posterior_of(CENSORED[name], gaps=True)
+    expected = dense(theta).log_density()
+    np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("limit", [0.0, 1.0])
+@pytest.mark.parametrize("name", CENSORED)
+def test_the_evidence_with_one_rate_at_a_limit_has_the_normal_tail_beyond_it(name, limit):
+    """Expectation propagation is exact if it has one term to approximate."""
+
+    def change(observations):
+        observations.contact_rate[2, 1, 1] = limit
+        return observations
+
+    posterior, theta, dense = posterior_of(CENSORED[name], gaps=True, change=change)
+    joint = dense(theta)
+    cov = joint.cov + joint.noise
+    expected = [with_one_limit(*moments, joint.y) for moments in zip(joint.mean, cov, strict=True)]
+    np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-9)
 
 
 @pytest.fixture
@@ -73,18 +73,28 @@ def chained(monkeypatch):
 
 @pytest.mark.usefixtures("chained")
 @pytest.mark.parametrize("gaps", [False, True])
-@pytest.mark.parametrize("name", [name for name in MODELS if RobotEffect() in MODELS[name].effects])
-def test_effects_split_into_chains_have_the_same_evidence_and_draws(name, gaps):
-    posterior, theta = posterior_of(name, gaps=gaps, shape=(7, 5, 3))
+@pytest.mark.parametrize("name", [name for name in GAUSSIAN if "robots" in name])
+def test_effects_split_into_chains_have_the_same_evidence(name, gaps):
+    posterior, theta, dense = posterior_of(GAUSSIAN[name], gaps=gaps, shape=(7, 5, 3))
     assert posterior.blocks.order.hidden.shape == (7, 3)
-    for i, value in enumerate(posterior.log_evidence(theta)):
-        dense = Dense(posterior.model, posterior.observations, at(theta, slice(i, i + 1)))
-        np.testing.assert_allclose(value, dense.log_density(), rtol=1e-9)
+    expected = dense(theta).log_density()
+    np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-9)
 
+
+@pytest.mark.usefixtures("chained")
+@pytest.mark.parametrize(
+    "name",
+    [
+        f"pooled, {EVERYTHING}",
+        f"pooled, deviation, shared noise, {EVERYTHING}",
+        "hierarchical, robots",
+        f"coupled, {EVERYTHING}",
+    ],
+)
+def test_effects_split_into_chains_have_the_same_draws(name):
+    posterior, theta, dense = posterior_of(GAUSSIAN[name], gaps=True, shape=(7, 5, 3))
     drawn = posterior.draw_coefficients(at(theta, np.zeros(4000, int)), np.random.default_rng(0))
-    mean, cov = Dense(
-        posterior.model, posterior.observations, at(theta, slice(0, 1))
-    ).coefficients()
+    mean, cov = (moment[0] for moment in dense(theta).coefficients())
     sd = np.sqrt(np.diag(cov))
     assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(4000)).all()
     np.testing.assert_allclose(drawn.std(0), sd, rtol=5.0 / np.sqrt(8000))
@@ -92,7 +102,7 @@ def test_effects_split_into_chains_have_the_same_evidence_and_draws(name, gaps):
 
 @pytest.mark.usefixtures("chained")
 def test_slopes_of_chains_in_jax_are_those_in_numpy():
-    posterior, _ = posterior_of("places and robots", gaps=True)
+    posterior, *_ = posterior_of(GAUSSIAN[f"pooled, {EVERYTHING}"], gaps=True)
     z = 0.5 * np.random.default_rng(3).standard_normal(posterior.n_scores)
     steps = 1e-4 * np.eye(len(z))
     expected = (posterior.log_density(z + steps) - posterior.log_density(z - steps)) / 2e-4
@@ -103,9 +113,10 @@ def test_slopes_of_chains_in_jax_are_those_in_numpy():
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 3), (3, 4, 1)])
 def test_one_bound_and_one_robot_are_cases_like_others(shape):
-    posterior, theta = posterior_of("shared noise", shape=shape)
-    dense = Dense(posterior.model, posterior.observations, at(theta, slice(0, 1)))
-    np.testing.assert_allclose(posterior.log_evidence(theta)[0], dense.log_density(), rtol=1e-9)
+    name = f"pooled, shared noise, {EVERYTHING}"
+    posterior, theta, dense = posterior_of(GAUSSIAN[name], shape=shape)
+    expected = dense(theta).log_density()
+    np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -113,11 +124,12 @@ def test_one_bound_and_one_robot_are_cases_like_others(shape):
     [("beta0", 0.0), ("beta0", 1 - 1e-6), ("delta_w", 1e-3), ("delta_v", 3.0), ("tau_e", 0.0)],
 )
 def test_the_evidence_holds_at_extreme_hyperparameters(name, value):
-    posterior, theta = posterior_of("places and robots", gaps=True)
+    posterior, theta, dense = posterior_of(GAUSSIAN[f"pooled, {EVERYTHING}"], gaps=True)
     theta = {**theta, name: np.full(3, value)}
     theta["inverse_gain"] = 1.0 - theta["beta0"]
-    dense = Dense(posterior.model, posterior.observations, at(theta, slice(0, 1)))
-    np.testing.assert_allclose(posterior.log_evidence(theta)[0], dense.log_density(), rtol=1e-7)
+    floor = {"tau_e": np.maximum(theta["tau_e"], LEAST)}
+    expected = dense(theta | floor).log_density()
+    np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-7)
 
 
 def test_a_matrix_that_is_not_positive_definite_costs_its_point_alone():
@@ -127,9 +139,13 @@ def test_a_matrix_that_is_not_positive_definite_costs_its_point_alone():
     np.testing.assert_allclose(factors[[0, 2]], np.stack([np.eye(2), 2.0 * np.eye(2)]))
 
 
-@pytest.mark.parametrize("name", ["shared noise", "coupled, places and robots"])
+OF_DRAWS = f"pooled, shared noise, {EVERYTHING}", f"coupled, {EVERYTHING}"
+
+
+@pytest.mark.parametrize("name", OF_DRAWS)
 def test_coefficients_drawn_often_at_visited_points_have_the_moments_of_the_joint_normal(name):
-    posterior, theta = posterior_of(name)
+    posterior, theta, dense = posterior_of(GAUSSIAN[name])
+    means, covs = dense(theta).coefficients()
     z = np.repeat(0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores)), 500, 0)
     rng = np.random.default_rng(0)
     log_p, coefficients = posterior.visit(z, rng)
@@ -137,67 +153,68 @@ def test_coefficients_drawn_often_at_visited_points_have_the_moments_of_the_join
     for k in range(3):
         first = np.arange(500 * k, 500 * (k + 1))
         drawn = coefficients.draw(np.repeat(first, 20), rng)
-        one = at(theta, slice(k, k + 1))
-        mean, cov = Dense(posterior.model, posterior.observations, one).coefficients()
-        sd = np.sqrt(np.diag(cov))
+        sd = np.sqrt(np.diag(covs[k]))
         n_independent = 4 * 500
-        assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(n_independent)).all()
+        assert (np.abs(drawn.mean(0) - means[k]) < 5.0 * sd / np.sqrt(n_independent)).all()
         np.testing.assert_allclose(drawn.std(0), sd, rtol=5.0 / np.sqrt(2 * n_independent))
 
 
-@pytest.mark.parametrize("name", ["shared noise", "coupled, places and robots"])
+@pytest.mark.parametrize("name", OF_DRAWS)
 def test_drawn_coefficients_have_the_moments_of_the_joint_normal(name):
-    posterior, theta = posterior_of(name)
-    one = at(theta, slice(0, 1))
+    posterior, theta, dense = posterior_of(GAUSSIAN[name])
     drawn = posterior.draw_coefficients(at(theta, np.zeros(20_000, int)), np.random.default_rng(0))
-    mean, cov = Dense(posterior.model, posterior.observations, one).coefficients()
+    mean, cov = (moment[0] for moment in dense(theta).coefficients())
     sd = np.sqrt(np.diag(cov))
     assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(20_000)).all()
     np.testing.assert_allclose(drawn.std(0), sd, rtol=0.04)
 
 
-@pytest.mark.parametrize(
-    "name", ["pooled", "deviation", "places and robots", "hierarchical", "coupled"]
-)
-def test_the_plain_program_has_the_density_of_the_equations(name):
-    """Given coefficients: the program's filter, and the matrices of `linear_predictor`."""
-    posterior, theta = posterior_of(name, gaps=True)
+PROGRAMS = {
+    "pooled": GAUSSIAN,
+    f"pooled, {EVERYTHING}": GAUSSIAN,
+    "pooled, deviation, robots": GAUSSIAN,
+    f"pooled, deviation, shared noise, {EVERYTHING}": GAUSSIAN,
+    "hierarchical, robots": GAUSSIAN,
+    "hierarchical, shared noise": GAUSSIAN,
+    "coupled": GAUSSIAN,
+    f"coupled, {EVERYTHING}": GAUSSIAN,
+    f"pooled, deviation, {EVERYTHING}": CENSORED,
+    "hierarchical, shared noise, robots": CENSORED,
+    "coupled, places": CENSORED,
+}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_the_plain_program_has_the_density_of_the_dense_joint_normal(name):
+    """Given coefficients, which the program samples without their prior mean."""
+    posterior, _, dense = posterior_of(PROGRAMS[name][name], gaps=True, shape=(3, 4, 2))
     model, observations, rng = posterior.model, posterior.observations, np.random.default_rng(2)
     values = posterior.scores.draw(20, rng)
-    theta = model.theta(values, observations.resolution)
-    density = log_density_of_rates(model, observations)
-    y = observations.contact_rate
-    resolution = np.nan_to_num(-np.log(observations.n_ticks[~np.isnan(y)]).sum())
+    joint = dense(model.theta(values, observations.resolution))
+    root = np.linalg.cholesky(joint.prior_cov)
+    deviation = (root @ rng.standard_normal((*root.shape[:2], 1)))[..., 0]
+
     with own_settings():
-        for i in range(20):
-            given = {n: jax.numpy.asarray(v[i]) for n, v in values.items()}
-            c, start = posterior.prior(at(theta, slice(i, i + 1))).draw(rng)[0], 0
-            for effect in model.terms:
-                mean, parts = effect.prior(at(theta, slice(i, i + 1)), observations)
-                first = start
-                for k, part in enumerate(parts):
-                    stop = start + part.shape[1]
-                    of_part = c[start:stop] - (
-                        0.0 if mean is None else mean[0, start - first : stop - first]
-                    )
-                    given[f"{effect.group or 'weights'}_{k}"] = jax.numpy.asarray(of_part)
-                    start = stop
-            found = float(density(given))
-            predictor = model.linear_predictor(
-                at(theta, slice(i, i + 1)), observations, posterior.layout
-            )
-            at_ = engine.expected(posterior.blocks, predictor, c[None])
-            W, log_sites = engine.whiten(
-                posterior.blocks, predictor, posterior.blocks.seen / predictor.noise_sd**2
-            )
-            w = W[:, posterior.blocks.kind] @ (posterior.blocks.y - at_)[..., None]
-            wanted = log_sites[:, posterior.blocks.kind].sum() - 0.5 * (w**2).sum()
-            wanted += resolution  # the program has the probability of tick counts
-            np.testing.assert_allclose(found, wanted, rtol=1e-9)
+        density, sizes = log_density_of_rates(model, observations)
+        first = 0
+        for site, size in sizes.items():
+            values[site] = deviation[:, first : first + size]
+            first += size
+        assert first == deviation.shape[1]
+        given = [{site: jax.numpy.asarray(v[i]) for site, v in values.items()} for i in range(20)]
+        found = [float(density(one)) for one in given]
+
+    expected = joint.log_density_given(joint.prior_mean + deviation)
+    if model.likelihood.gaussian:  # the program has the probability of tick counts
+        expected -= np.log(observations.n_ticks[~np.isnan(observations.contact_rate)]).sum()
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def log_density_of_rates(model, observations):
-    """By the program; noise that it samples is integrated out, as its log-density is quadratic."""
+    """By the program; also the sizes of the sites of its coefficients by name.
+
+    Noise that it samples is integrated out, as its log-density is quadratic.
+    """
 
     def sites(given):
         program = handlers.substitute(handlers.seed(model.program, 0), given)
@@ -221,21 +238,29 @@ def log_density_of_rates(model, observations):
         size = zero.size * np.log(2 * np.pi) - jax.numpy.linalg.slogdet(precision)[1]
         return log_joint(zero) + 0.5 * (gain + size)
 
-    return jax.jit(density)
+    groups = "weights", "places", "robots"
+    of_coefficients = {
+        site: values["value"].size
+        for site, values in sites({}).items()
+        if site.rpartition("_")[0] in groups
+    }
+    return jax.jit(density), of_coefficients
 
 
-@pytest.mark.parametrize("name", ["places and robots", "coupled"])
+@pytest.mark.parametrize("name", [f"pooled, {EVERYTHING}", "coupled"])
 def test_jax_and_numpy_give_one_evidence(name):
-    posterior, theta = posterior_of(name, gaps=True)
+    posterior, theta, _ = posterior_of(GAUSSIAN[name], gaps=True)
     with own_settings():
         in_jax = {key: jax.numpy.asarray(values) for key, values in theta.items()}
         found = np.asarray(posterior.log_evidence(in_jax))
     np.testing.assert_allclose(found, posterior.log_evidence(theta), rtol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["places and robots", "shared noise", "coupled"])
+@pytest.mark.parametrize(
+    "name", [f"pooled, {EVERYTHING}", f"pooled, shared noise, {EVERYTHING}", "coupled"]
+)
 def test_slopes_in_jax_are_those_of_the_density_in_numpy(name):
-    posterior, _ = posterior_of(name, gaps=True)
+    posterior, *_ = posterior_of(GAUSSIAN[name], gaps=True)
     z = 0.5 * np.random.default_rng(3).standard_normal(posterior.n_scores)
     steps = 1e-4 * np.eye(len(z))
     expected = (posterior.log_density(z + steps) - posterior.log_density(z - steps)) / 2e-4

@@ -1,0 +1,181 @@
+"""The reference of the state-space form: the joint normal distribution of a mission's trust.
+
+    d_k = A d_{k-1} + u_k + w_k,    w_k ~ N(0, Q),    d_0 ~ N(m0, P0)
+    x_k = d_k + o_k,                y_k = x_k + v_k,  v_k ~ N(0, R)
+
+Means and covariances follow from these equations one bound after the other, and all bounds are
+conditioned on at once. Nothing of the package is imported, and its parameters are only read.
+
+Arrays may have leading axes, such as (draw,). The trust of a mission is flat over (bound, robot).
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+STEPS = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right]
+"""The eight moves between cells, row by row from the north-west."""
+
+
+class Form(NamedTuple):
+    """Parameters of the equations; R is the covariance of all noise of the rates of a bound."""
+
+    A: np.ndarray  # (..., robot, robot)
+    Q: np.ndarray  # (..., robot, robot)
+    m0: np.ndarray  # (..., robot)
+    P0: np.ndarray  # (..., robot, robot)
+    R: np.ndarray  # (..., robot, robot)
+
+
+def form_of(
+    beta0, delta_w, delta_v, x0_mean=0.5, x0_sd=0.5, *, n_robots, delta_s=0.0, deviation=False
+):
+    """Form of equations (1)-(2) or (3)-(4), for numbers, values (robot,) or matrices.
+
+    Noises are standard deviations, or covariance matrices. All robots share the noise `delta_s`.
+    If the deviation from expected trust is what lasts, it has mean 0 at first.
+    """
+    own = np.eye(n_robots)
+
+    def covariance(noise):
+        noise = np.asarray(noise, float)
+        return noise if noise.ndim == 2 else noise**2 * own
+
+    beta0 = np.asarray(beta0, float)
+    return Form(
+        A=beta0 if beta0.ndim == 2 else beta0 * own,
+        Q=covariance(delta_w),
+        m0=(0.0 if deviation else 1.0) * x0_mean * np.ones(n_robots),
+        P0=np.asarray(x0_sd) ** 2 * own,
+        R=covariance(delta_v) + delta_s**2,
+    )
+
+
+def stacked(forms):
+    """Forms of several draws as one, with a leading axis."""
+    return Form(*(np.stack(values) for values in zip(*forms, strict=True)))
+
+
+def expected_trust(form, drift, offset):
+    """Expected trust (..., bound, robot) for inputs (..., bound, robot)."""
+    state = form.m0
+    trust = []
+    for k in range(drift.shape[-2]):
+        state = (form.A @ state[..., None])[..., 0] + drift[..., k, :]
+        trust.append(state + offset[..., k, :])
+    return np.stack(trust, axis=-2)
+
+
+def trust_covariance(form, n_bounds):
+    """Covariance (..., bound * robot, bound * robot) of the trust of all bounds."""
+    A, Q, _, P, _ = form
+    blocks = [[None] * n_bounds for _ in range(n_bounds)]
+    for k in range(n_bounds):
+        P = A @ P @ A.mT + Q
+        blocks[k][k] = P
+        for j in range(k):
+            blocks[k][j] = A @ blocks[k - 1][j]
+            blocks[j][k] = blocks[k][j].mT
+    return np.block(blocks)
+
+
+def rate_noise(form, n_bounds):
+    """Covariance (..., bound * robot, bound * robot) of the noise of all rates."""
+    none = np.zeros_like(form.R)
+    return np.block([[form.R if j == k else none for j in range(n_bounds)] for k in range(n_bounds)])
+
+
+def log_density(mean, cov, y):
+    """Log density (...,) of N(mean, cov) at the values y (n,) that are not NaN."""
+    seen = ~np.isnan(y)
+    off = (y - mean)[..., seen]
+    cov = cov[..., seen, :][..., seen]
+    quadratic = (off * np.linalg.solve(cov, off[..., None])[..., 0]).sum(-1)
+    return -0.5 * (quadratic + np.linalg.slogdet(2.0 * np.pi * cov)[1])
+
+
+def conditional(x_mean, x_cov, cross, y_mean, y_cov, y):
+    """Mean and covariance of x given the values y (n,) that are not NaN.
+
+    `cross` (..., x, y) is the covariance of x and y.
+    """
+    seen = ~np.isnan(y)
+    cross = cross[..., seen]
+    gain = np.linalg.solve(y_cov[..., seen, :][..., seen], cross.mT).mT
+    off = (y - y_mean)[..., seen]
+    return x_mean + (gain @ off[..., None])[..., 0], x_cov - gain @ cross.mT
+
+
+class Mission(NamedTuple):
+    """Joint normal of a mission's trust x and rates y, flat over (bound, robot)."""
+
+    mean: np.ndarray  # (..., n), of trust and of rates
+    trust_cov: np.ndarray  # (..., n, n)
+    rate_cov: np.ndarray  # (..., n, n)
+
+    def log_density(self, rates):
+        """Log density (...,) of rates (bound, robot), NaN where not measured."""
+        return log_density(self.mean, self.rate_cov, np.ravel(rates))
+
+    def trust_given(self, rates):
+        """Mean (..., n) and covariance (..., n, n) of trust given rates (bound, robot)."""
+        trust = self.mean, self.trust_cov
+        return conditional(*trust, self.trust_cov, self.mean, self.rate_cov, np.ravel(rates))
+
+    def rates_given(self, rates):
+        """Mean (..., n) and covariance (..., n, n) of new rates, with other noise."""
+        mean, cov = self.trust_given(rates)
+        return mean, cov + self.rate_cov - self.trust_cov
+
+
+def mission_of(form, drift, offset):
+    """Joint normal of a mission for inputs (..., bound, robot)."""
+    n_bounds = drift.shape[-2]
+    mean = expected_trust(form, drift, offset)
+    cov = trust_covariance(form, n_bounds)
+    return Mission(mean.reshape(*mean.shape[:-2], -1), cov, cov + rate_noise(form, n_bounds))
+
+
+def mission_of_params(params, awareness, path=None, *, x0=None):
+    """Joint normal of a mission under one draw of `TrustParams`, `RobotParams` or `CoupledParams`.
+
+    Args:
+        params: One draw, whose fields are read.
+        awareness: Awareness (bound, robot, feature).
+        path: Cells from the start on; needed with effects of places.
+        x0: Trust before the first bound, if it is known.
+    """
+    n_bounds, n_robots, n_features = awareness.shape
+    u = np.zeros((n_bounds, n_robots))
+    for k in range(n_bounds):
+        for i in range(n_robots):
+            u[k, i] = params.b[i] if np.ndim(params.b) else params.b
+            for m in range(n_features):
+                if hasattr(params, "B0"):
+                    u[k, i] += sum(
+                        params.B[m, i, j] * awareness[k, j, m] for j in range(n_robots)
+                    )
+                else:
+                    beta = params.beta[i] if np.ndim(params.beta) == 2 else params.beta
+                    u[k, i] += beta[m] * awareness[k, i, m]
+
+    if params.place is not None or params.place_bound is not None:
+        for k, (before, cell) in enumerate(pairwise(path)):
+            move = STEPS.index((cell[0] - before[0], cell[1] - before[1]))
+            if params.place is not None:
+                u[k] += params.place[:, cell[0], cell[1]]
+            if params.place_bound is not None:
+                u[k] += params.place_bound[:, move, cell[0], cell[1]]
+
+    x0_mean, x0_sd = (params.x0_mean, params.x0_sd) if x0 is None else (x0, 0.0)
+    if hasattr(params, "B0"):
+        named = params.B0, params.Delta_w, params.Delta_v
+        return mission_of(form_of(*named, x0_mean, x0_sd, n_robots=n_robots), u, 0.0 * u)
+
+    deviation = params.memory == "deviation"
+    form = form_of(
+        params.beta0, params.delta_w, params.delta_v, x0_mean, x0_sd, n_robots=n_robots,
+        delta_s=0.0 if params.delta_s is None else params.delta_s, deviation=deviation,
+    )  # fmt: skip
+    return mission_of(form, 0.0 * u, u) if deviation else mission_of(form, u, 0.0 * u)
