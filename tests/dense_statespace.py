@@ -83,7 +83,9 @@ def trust_covariance(form, n_bounds):
 def rate_noise(form, n_bounds):
     """Covariance (..., bound * robot, bound * robot) of the noise of all rates."""
     none = np.zeros_like(form.R)
-    return np.block([[form.R if j == k else none for j in range(n_bounds)] for k in range(n_bounds)])
+    return np.block(
+        [[form.R if j == k else none for j in range(n_bounds)] for k in range(n_bounds)]
+    )
 
 
 def log_density(mean, cov, y):
@@ -153,9 +155,7 @@ def mission_of_params(params, awareness, path=None, *, x0=None):
             u[k, i] = params.b[i] if np.ndim(params.b) else params.b
             for m in range(n_features):
                 if hasattr(params, "B0"):
-                    u[k, i] += sum(
-                        params.B[m, i, j] * awareness[k, j, m] for j in range(n_robots)
-                    )
+                    u[k, i] += sum(params.B[m, i, j] * awareness[k, j, m] for j in range(n_robots))
                 else:
                     beta = params.beta[i] if np.ndim(params.beta) == 2 else params.beta
                     u[k, i] += beta[m] * awareness[k, i, m]

@@ -1,142 +1,246 @@
-"""The form against the paper's equations written out, bound by bound."""
+"""The form, its recursion and its draws against the joint normal written out, bound by bound."""
 
 import numpy as np
 import pytest
-from scipy.linalg import block_diag, helmert
+from dense_statespace import form_of, mission_of
+from scipy import stats
+from scipy.linalg import helmert
+from unit_noise import UnitNoise
 
 from trustbo.models.families import FAMILIES
-from trustbo.statespace import Inputs, StateSpace, kalman
+from trustbo.statespace import Inputs, kalman
 from trustbo.statespace.blocks import Layout, LinearPredictor
 from trustbo.statespace.form import coupled_robots, independent_robots
 
 K = 5
+N_POINTS = 2
+N_ROBOTS = 3
 
 
-def pooled(n_points=2, **options):
+def pooled(**options):
+    """Equal robots: their form, and the dense form of each point."""
     rng = np.random.default_rng(0)
-    beta0, delta_w, delta_v = rng.uniform(0.1, 0.9, (3, n_points))
-    return independent_robots(beta0, delta_w, delta_v, 0.5, 0.4, **options)
+    numbers = rng.uniform(0.1, 0.9, (3, N_POINTS))
+    x0 = rng.uniform(0.3, 0.7, (2, N_POINTS))
+    shared = options.get("delta_s", np.zeros(N_POINTS))
+    dense = [
+        form_of(*numbers[:, p], *x0[:, p], n_robots=N_ROBOTS, delta_s=shared[p])
+        for p in range(N_POINTS)
+    ]
+    return independent_robots(*numbers, *x0, **options), dense
 
 
-def coupled(n=3, n_points=2):
+def different(**options):
+    """Robots with parameters of their own."""
+    rng = np.random.default_rng(2)
+    numbers = rng.uniform(0.1, 0.9, (5, N_POINTS, N_ROBOTS))
+    shared = options.get("delta_s", np.zeros(N_POINTS))
+    dense = [form_of(*numbers[:, p], n_robots=N_ROBOTS, delta_s=shared[p]) for p in range(N_POINTS)]
+    return independent_robots(*numbers, **options), dense
+
+
+def coupled():
+    """Robots that influence each other."""
     rng = np.random.default_rng(1)
-    B0 = rng.uniform(-0.3, 0.5, (n_points, n, n))
-    root_w, root_v = rng.normal(size=(2, n_points, n, n))
-    Delta_w = root_w @ np.swapaxes(root_w, 1, 2)
-    Delta_v = root_v @ np.swapaxes(root_v, 1, 2)
-    return coupled_robots(B0, Delta_w, Delta_v, 0.5, 0.4)
+    B0 = rng.uniform(-0.3, 0.5, (N_POINTS, N_ROBOTS, N_ROBOTS))
+    root_w, root_v = rng.normal(size=(2, N_POINTS, N_ROBOTS, N_ROBOTS))
+    matrices = B0, root_w @ root_w.mT, root_v @ root_v.mT
+    dense = [
+        form_of(*(matrix[p] for matrix in matrices), 0.5, 0.4, n_robots=N_ROBOTS)
+        for p in range(N_POINTS)
+    ]
+    return coupled_robots(*matrices, 0.5, 0.4), dense
 
 
+SHARED = {"delta_s": np.array([0.3, 0.1]), "n_members": N_ROBOTS}
 SPACES = {
-    "independent": pooled(),
-    "different robots": independent_robots(
-        *np.random.default_rng(2).uniform(size=(3, 2, 3)), 0.5, 0.4
-    ),
-    "shared noise": pooled(delta_s=np.array([0.3, 0.1]), n_members=3),
+    "equal robots": pooled(),
+    "different robots": different(),
+    "equal robots, shared noise": pooled(**SHARED),
+    "different robots, shared noise": different(**SHARED),
     "coupled": coupled(),
 }
 
 
-def stepwise(space: StateSpace, point, group, u):
-    """Mean and covariance of the states of all bounds, from the equation itself."""
+def inputs_of(space, *, offset=True, seed=4):
+    """Drift and offset (bound, robot), and the `Inputs` of each bound, equal at all points."""
+    drift, of_bounds = np.random.default_rng(seed).normal(size=(2, K, N_ROBOTS))
+    of_bounds = of_bounds * offset
+    inputs = [
+        Inputs(*(space.grouped(values[None]) for values in pair))
+        for pair in zip(drift, of_bounds, strict=True)
+    ]
+    return drift, of_bounds, inputs
 
-    def of(values):
-        return values[point, group if values.shape[1] > 1 else 0]
 
-    A, Q = of(space.transition), of(space.process_cov)
-    n = len(A)
-    mean = of(space.initial_mean)
-    noise = block_diag(of(space.initial_cov), *[Q] * K)  # (d_0, w_1, ..., w_K)
-    response = np.zeros((n, n * (K + 1)))
-    response[:, :n] = np.eye(n)
-    means, rows = [], []
-    for k in range(K):
-        mean = A @ mean + u[k]
-        response = A @ response
-        response[:, n * (k + 1) : n * (k + 2)] += np.eye(n)
-        means.append(mean)
-        rows.append(response)
+def rates_of(seed=5):
+    """Rates (bound, robot), some of which were not measured."""
+    rates = np.random.default_rng(seed).normal(size=(K, N_ROBOTS))
+    rates[1, 2] = np.nan
+    rates[3] = np.nan
+    return rates
 
-    rows = np.concatenate(rows)
-    return np.concatenate(means), rows @ noise @ rows.T
+
+def over_robots(cov):
+    """Covariance (point, robot, robot) of all robots from that of groups."""
+    n_points, n_groups, n, _ = cov.shape
+    every = np.zeros((n_points, N_ROBOTS, N_ROBOTS))
+    for i in range(N_ROBOTS):
+        for j in range(N_ROBOTS):
+            if i // n == j // n:
+                every[:, i, j] = cov[:, min(i // n, n_groups - 1), i % n, j % n]
+    return every
+
+
+def n_groups_of(space):
+    return N_ROBOTS // space.n_members
 
 
 @pytest.mark.parametrize("name", SPACES)
 def test_moments_are_those_of_the_equation(name):
-    space = SPACES[name]
-    n = space.n_members
-    u = np.random.default_rng(3).normal(size=(K, n))
+    space, forms = SPACES[name]
+    n, n_groups = space.n_members, n_groups_of(space)
+    drift, *_ = inputs_of(space)
+    u = space.grouped(drift).swapaxes(0, 1).reshape(n_groups, K * n)
     mean, response, cov = space.moments(K)
-    for point in range(2):
-        for group in range(mean.shape[1]):
-            at = group if response.shape[1] > 1 else 0
-            wanted_mean, wanted_cov = stepwise(space, point, group, u)
-            found = mean[point, group] + response[point, at] @ u.ravel()
-            np.testing.assert_allclose(found, wanted_mean, rtol=1e-10, atol=1e-12)
-            np.testing.assert_allclose(cov[point, at], wanted_cov, rtol=1e-10, atol=1e-12)
+    for point in range(N_POINTS):
+        dense = mission_of(forms[point], drift, 0.0 * drift)
+        of_bounds = dense.trust_cov.reshape(K, N_ROBOTS, K, N_ROBOTS)
+        for group in range(n_groups):
+            robots = slice(group * n, (group + 1) * n)
+            expected = dense.mean.reshape(K, N_ROBOTS)[:, robots].ravel()
+            at = min(group, response.shape[1] - 1)
+            found = mean[point, min(group, mean.shape[1] - 1)] + response[point, at] @ u[group]
+            np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+            expected = of_bounds[:, robots, :, robots].reshape(K * n, K * n)
+            np.testing.assert_allclose(cov[point, at], expected, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", SPACES)
 @pytest.mark.parametrize("offset", [False, True])
 def test_the_recursion_has_the_moments_of_all_bounds(name, offset):
-    space = SPACES[name]
-    n = space.n_members
-    n_groups = space.noise_sd.shape[1]
-    rng = np.random.default_rng(4)
-    u, o = rng.normal(size=(2, K, 2, n_groups, n))
-    o = o * offset
-    mean, response, cov = space.moments(K)
-    belief = kalman.initial(space, n_groups)
+    space, forms = SPACES[name]
+    drift, of_bounds, inputs = inputs_of(space, offset=offset)
+    dense = [mission_of(form, drift, of_bounds) for form in forms]
+    belief = kalman.initial(space, n_groups_of(space))
     for k in range(K):
-        belief = kalman.predict(space, belief, Inputs(u[k], o[k]))
-        rows = slice(k * n, (k + 1) * n)
-        of_u = np.moveaxis(u, 0, 2).reshape(2, n_groups, -1)
-        wanted = mean[..., rows] + (response[..., rows, :] @ of_u[..., None])[..., 0] + o[k]
-        np.testing.assert_allclose(belief.mean, wanted, rtol=1e-10, atol=1e-12)
-        np.testing.assert_allclose(
-            belief.cov, np.broadcast_to(cov[..., rows, rows], belief.cov.shape), rtol=1e-10
-        )
+        belief = kalman.predict(space, belief, inputs[k])
+        rows = slice(k * N_ROBOTS, (k + 1) * N_ROBOTS)
+        mean = [one.mean[rows] for one in dense]
+        cov = [one.trust_cov[rows, rows] for one in dense]
+        np.testing.assert_allclose(belief.mean.reshape(N_POINTS, -1), mean, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(over_robots(belief.cov), cov, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["shared noise", "coupled"])
-def test_the_filter_has_the_density_and_the_trust_of_the_joint_normal(name):
-    space = SPACES[name]
-    rng = np.random.default_rng(5)
-    u = rng.normal(size=(K, 2, 1, 3))
-    y = rng.normal(size=(K, 1, 3))
-    y[1, 0, 2] = np.nan
-    y[3] = np.nan
-    layout = Layout.from_rates(np.full((1, K, 3), np.nan), joint=True)
-    predictor = LinearPredictor.from_space(space, layout)
-    belief = kalman.initial(space, 1)
-    log_density = 0.0
+@pytest.mark.parametrize("name", SPACES)
+@pytest.mark.parametrize("offset", [False, True])
+def test_the_filter_has_the_density_and_the_trust_of_the_joint_normal(name, offset):
+    space, forms = SPACES[name]
+    drift, of_bounds, inputs = inputs_of(space, offset=offset)
+    rates = rates_of()
+    belief = kalman.initial(space, n_groups_of(space))
+    total = 0.0
     for k in range(K):
-        predicted = kalman.predict(space, belief, Inputs(u[k]))
-        belief, gained = kalman.update(space, predicted, y[k], np.nan * y[k], FAMILIES["gaussian"])
-        log_density = log_density + gained
-
-    seen = ~np.isnan(y.ravel())
-    for point in range(2):
-        mean = predictor.mean[point, 0] + predictor.response[point, 0] @ u[:, point].ravel()
-        cov = predictor.covariance[point, 0] + np.diag(
-            np.broadcast_to(predictor.noise_sd[point, 0], mean.shape) ** 2
+        predicted = kalman.predict(space, belief, inputs[k])
+        y = space.grouped(rates[k])
+        apart = kalman.marginal_log_densities(space, predicted, y, y, FAMILIES["gaussian"])
+        belief, gained = kalman.update(space, predicted, y, y, FAMILIES["gaussian"])
+        total = total + gained
+        rows = slice(k * N_ROBOTS, (k + 1) * N_ROBOTS)
+        before, until = (
+            np.where(np.arange(K)[:, None] < k + more, rates, np.nan) for more in (0, 1)
         )
-        off = y.ravel()[seen] - mean[seen]
-        V = cov[np.ix_(seen, seen)]
-        cross = predictor.trust_cov[point, 0][-3:, seen]
-        wanted = -0.5 * (off @ np.linalg.solve(V, off) + np.linalg.slogdet(2.0 * np.pi * V)[1])
-        assert log_density[point] == pytest.approx(wanted, rel=1e-9)
-        trust = mean[-3:] + cross @ np.linalg.solve(V, off)
-        np.testing.assert_allclose(belief.mean[point, 0], trust, rtol=1e-8, atol=1e-10)
+        for point, form in enumerate(forms):
+            dense = mission_of(form, drift, of_bounds)
+            expected = dense.log_density(until)
+            np.testing.assert_allclose(total[point], expected, rtol=1e-9)
+            mean, cov = dense.trust_given(until)
+            np.testing.assert_allclose(
+                belief.mean[point].ravel(), mean[rows], rtol=1e-9, atol=1e-11
+            )
+            found = over_robots(belief.cov)[point]
+            np.testing.assert_allclose(found, cov[rows, rows], rtol=1e-9, atol=1e-11)
+
+            mean, cov = dense.rates_given(before)
+            of_each = stats.norm.logpdf(rates[k], mean[rows], np.sqrt(np.diag(cov)[rows]))
+            np.testing.assert_allclose(apart[point], np.nan_to_num(of_each), rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.parametrize("point", range(N_POINTS))
+@pytest.mark.parametrize("name", SPACES)
+def test_trust_is_drawn_from_the_joint_normal_given_the_rates(name, point):
+    """Its mean and covariance, up to the variance of 1e-12 that keeps draws from failing."""
+    space, forms = SPACES[name]
+    drift, of_bounds, inputs = inputs_of(space)
+    rates = rates_of()
+    copies = space.take(np.full(1 + K * N_ROBOTS, point))
+    rng = UnitNoise()
+    y = space.grouped(rates)
+    drawn = kalman.draw_trust(copies, inputs, y, n_groups_of(space), rng)
+
+    mean, cov = rng.moments(drawn)
+    expected_mean, expected_cov = mission_of(forms[point], drift, of_bounds).trust_given(rates)
+    np.testing.assert_allclose(mean, expected_mean, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(cov, expected_cov, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["different robots", "coupled"])
+def test_many_draws_of_trust_have_the_moments_of_the_joint_normal(name):
+    """Within 5 standard errors; numbers of a generator differ from point to point."""
+    n = 4000
+    space, forms = SPACES[name]
+    drift, of_bounds, inputs = inputs_of(space)
+    rates = rates_of()
+    copies = space.take(np.zeros(n, int))
+    groups = n_groups_of(space)
+    drawn = kalman.draw_trust(
+        copies, inputs, space.grouped(rates), groups, np.random.default_rng(0)
+    ).reshape(n, -1)
+
+    mean, cov = mission_of(forms[0], drift, of_bounds).trust_given(rates)
+    sd = np.sqrt(np.diag(cov))
+    assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(n)).all()
+    np.testing.assert_allclose(
+        np.cov(drawn.T) / np.outer(sd, sd), cov / np.outer(sd, sd), atol=5.0 * np.sqrt(2.0 / n)
+    )
+
+
+@pytest.mark.parametrize("n_known", [0, 2])
+@pytest.mark.parametrize("name", SPACES)
+def test_forecasts_of_all_rates_are_drawn_from_the_joint_normal(name, n_known):
+    """Given the rates of the first bounds; the covariance between later bounds is that of trust."""
+    space, forms = SPACES[name]
+    drift, of_bounds, inputs = inputs_of(space)
+    rates = rates_of()
+    rates[n_known:] = np.nan
+    n_ahead = K - n_known
+    n_noises = N_ROBOTS * (1 + 3 * n_ahead)  # trust now, then process, shared and own noise
+    copies = space.take(np.zeros(1 + n_noises, int))
+    belief = kalman.initial(copies, n_groups_of(space))
+    for k in range(n_known):
+        y = space.grouped(rates[k])
+        predicted = kalman.predict(copies, belief, inputs[k])
+        belief, _ = kalman.update(copies, predicted, y, y, FAMILIES["gaussian"])
+
+    rng = UnitNoise()
+    ticks = space.grouped(np.full((n_ahead, N_ROBOTS), np.nan))
+    ahead = kalman.forecast(copies, belief, inputs[n_known:], ticks, FAMILIES["gaussian"], rng)
+    drawn = np.stack([rates_drawn for _, rates_drawn in ahead], axis=1)
+
+    mean, cov = rng.moments(drawn)
+    expected_mean, expected_cov = mission_of(forms[0], drift, of_bounds).rates_given(rates)
+    rows = slice(n_known * N_ROBOTS, None)
+    np.testing.assert_allclose(mean, expected_mean[rows], rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(cov, expected_cov[rows, rows], rtol=1e-9, atol=1e-10)
 
 
 def test_contrasts_of_exchangeable_robots_are_independent():
-    space = SPACES["shared noise"]
+    space = SPACES["equal robots, shared noise"][0]
     rotation = helmert(3, full=True)
     joint = LinearPredictor.from_space(space, Layout((1, K, 3), joint=True))
     apart = LinearPredictor.from_space(space, Layout((1, K, 3), rotation=rotation))
     turn = np.kron(np.eye(K), rotation)
-    for point in range(2):
+    for point in range(N_POINTS):
         cov = turn @ joint.covariance[point, 0] @ turn.T
         mean = turn @ joint.mean[point, 0]
         for i in range(3):
