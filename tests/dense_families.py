@@ -9,6 +9,13 @@ from dense_statespace import conditional, log_density
 from scipy import special, stats
 from scipy.stats import norm
 
+LOGISTIC = (
+    np.array([0.252201, 0.585225, 0.162574]),
+    np.sqrt(3.0) / np.pi / np.array([0.90793, 0.577787, 0.364038]),
+)
+"""Shares and standard deviations of the normal mixture that stands for a logistic distribution with
+standard deviation 1 (Monahan and Stefanski 1992)."""
+
 
 def likelihood(family, y, n_ticks, f, sd):
     """Density or probability of a rate given linear predictors f."""
@@ -20,6 +27,21 @@ def likelihood(family, y, n_ticks, f, sd):
     if family == "censored" and y >= 1.0:
         return norm.sf(1.0, f, sd)
     return norm.pdf(y, f, sd)
+
+
+def of_one_report(mean, var, level, n_levels, sd):
+    """Log probability of a report of a level, with logistic noise, given normal trust."""
+    n = n_levels - 1
+    ends = [
+        -np.inf if level == 0 else (level - 0.5) / n,
+        np.inf if level == n else (level + 0.5) / n,
+    ]
+    shares, sds = LOGISTIC
+    p = 0.0
+    for share, of_one in zip(shares / shares.sum(), sds, strict=True):
+        low, high = norm.cdf(ends, mean, np.hypot(np.sqrt(var), of_one * sd))
+        p += share * (high - low)
+    return np.log(p)
 
 
 def with_one_limit(mean, cov, y):
@@ -35,19 +57,58 @@ def with_one_limit(mean, cov, y):
     return log_density(mean, cov, others) + tail
 
 
-def by_quadrature(family, mean, cov, y, n_ticks, sd, n_points=801):
+def trust_with_one_limit(mean, trust_cov, rate_cov, y):
+    """Mean and standard deviation (rate,) of trust given rates as in `with_one_limit`."""
+    [at] = np.flatnonzero((y <= 0.0) | (y >= 1.0))
+    others = np.where(np.arange(len(y)) == at, np.nan, y)
+
+    # Trust and, last, the rate, given the other rates.
+    one = [at]
+    joint = np.block([[trust_cov, trust_cov[:, one]], [trust_cov[one], rate_cov[np.ix_(one, one)]]])
+    cross = np.vstack([trust_cov, rate_cov[one]])
+    m, cov = conditional(np.append(mean, mean[at]), joint, cross, mean, rate_cov, others)
+
+    # The rate is normal, and lies beyond the limit.
+    sd = np.sqrt(cov[-1, -1])
+    truncated = stats.truncnorm(-np.inf, (y[at] - m[-1]) / sd)
+    if y[at] >= 1.0:
+        truncated = stats.truncnorm((y[at] - m[-1]) / sd, np.inf)
+    gain = cov[:-1, -1] / sd
+    left = np.diag(cov)[:-1] - gain**2 * (1.0 - truncated.var())
+    return m[:-1] + gain * truncated.mean(), np.sqrt(left)
+
+
+def expected_rate(family, trust, sd):
+    """Expected rate given trust: of a normal variable that is clipped to [0, 1], or a logistic."""
+    if family == "beta_binomial":
+        return special.expit(trust)
+    if family == "gaussian":
+        return trust
+
+    def integral(x):
+        return x * norm.cdf(x) + norm.pdf(x)
+
+    return sd * (integral(trust / sd) - integral((trust - 1.0) / sd))  # of P(rate > t) over t
+
+
+def by_quadrature(family, mean, trust_cov, noise, y, n_ticks, n_points=401):
     """Log density of two rates, NaN if not measured, over a grid of their linear predictors.
 
-    `mean` and `cov` are those of the linear predictors, without the own noise of the rates.
+    `mean` and `trust_cov` are of trust, and `noise` is the covariance of the noise of the rates.
     """
+    if family == "beta_binomial":
+        cov, sd = trust_cov, np.sqrt(np.diag(noise))
+    else:  # a part of the noise is apart for each rate, and the rest is in the predictors
+        own = 0.5 * np.linalg.eigvalsh(noise).min()
+        cov, sd = trust_cov + noise - own * np.eye(2), np.sqrt([own, own])
+
     e = np.linspace(-8.0, 8.0, n_points)
     a, b = np.meshgrid(e, e, indexing="ij")
     root = np.linalg.cholesky(cov)
     f = mean[:, None, None] + np.stack([root[0, 0] * a, root[1, 0] * a + root[1, 1] * b])
     density = norm.pdf(a) * norm.pdf(b)
-    for k in range(2):
-        if not np.isnan(y[k]):
-            density = density * likelihood(family, y[k], n_ticks, f[k], sd[k])
+    for k in np.flatnonzero(~np.isnan(y)):
+        density = density * likelihood(family, y[k], n_ticks, f[k], sd[k])
     return np.log(density.sum()) + 2.0 * np.log(e[1] - e[0])
 
 

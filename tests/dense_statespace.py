@@ -140,10 +140,20 @@ def mission_of(form, drift, offset):
 
 
 def mission_of_params(params, awareness, path=None, *, x0=None):
-    """Joint normal of a mission under one draw of `TrustParams`, `RobotParams` or `CoupledParams`.
+    """Joint normal of a mission under one draw of parameters; see `equations_of_params`."""
+    return mission_of(*equations_of_params(params, awareness, path, x0=x0))
+
+
+def trust_of_params(params, awareness, path=None, *, x0=None):
+    """Expected trust (bound, robot) under one draw of parameters; see `equations_of_params`."""
+    return expected_trust(*equations_of_params(params, awareness, path, x0=x0))
+
+
+def equations_of_params(params, awareness, path=None, *, x0=None):
+    """Form, drift and offset (bound, robot) of a mission under one draw of parameters.
 
     Args:
-        params: One draw, whose fields are read.
+        params: One draw of `TrustParams`, `RobotParams` or `CoupledParams`, whose fields are read.
         awareness: Awareness (bound, robot, feature).
         path: Cells from the start on; needed with effects of places.
         x0: Trust before the first bound, if it is known.
@@ -155,7 +165,8 @@ def mission_of_params(params, awareness, path=None, *, x0=None):
             u[k, i] = params.b[i] if np.ndim(params.b) else params.b
             for m in range(n_features):
                 if hasattr(params, "B0"):
-                    u[k, i] += sum(params.B[m, i, j] * awareness[k, j, m] for j in range(n_robots))
+                    for j in range(n_robots):
+                        u[k, i] += params.B[m, i, j] * awareness[k, j, m]
                 else:
                     beta = params.beta[i] if np.ndim(params.beta) == 2 else params.beta
                     u[k, i] += beta[m] * awareness[k, i, m]
@@ -168,14 +179,14 @@ def mission_of_params(params, awareness, path=None, *, x0=None):
             if params.place_bound is not None:
                 u[k] += params.place_bound[:, move, cell[0], cell[1]]
 
-    x0_mean, x0_sd = (params.x0_mean, params.x0_sd) if x0 is None else (x0, 0.0)
+    x0 = (params.x0_mean, params.x0_sd) if x0 is None else (x0, 0.0)
     if hasattr(params, "B0"):
-        named = params.B0, params.Delta_w, params.Delta_v
-        return mission_of(form_of(*named, x0_mean, x0_sd, n_robots=n_robots), u, 0.0 * u)
+        form = form_of(params.B0, params.Delta_w, params.Delta_v, *x0, n_robots=n_robots)
+        return form, u, np.zeros_like(u)
 
     deviation = params.memory == "deviation"
     form = form_of(
-        params.beta0, params.delta_w, params.delta_v, x0_mean, x0_sd, n_robots=n_robots,
+        params.beta0, params.delta_w, params.delta_v, *x0, n_robots=n_robots,
         delta_s=0.0 if params.delta_s is None else params.delta_s, deviation=deviation,
     )  # fmt: skip
-    return mission_of(form, 0.0 * u, u) if deviation else mission_of(form, u, 0.0 * u)
+    return (form, np.zeros_like(u), u) if deviation else (form, u, np.zeros_like(u))

@@ -62,26 +62,26 @@ def draws_of(kind, *, n_draws=3, n_robots=3, shape=GRID, seed=0):
     rng = np.random.default_rng(seed)
     model, *words = kind.split(", ")
     beta0 = rng.uniform(0.2, 0.8, n_draws)
-    x0 = rng.uniform(0.4, 0.6, n_draws), rng.uniform(0.1, 0.4, n_draws)
+    x0 = rng.uniform(0.4, 0.6, n_draws), rng.uniform(0.05, 0.2, n_draws)
     places = {}
     if "places" in words:
         n = 1 if model == "pooled" else n_robots
-        places["place"] = 0.1 * rng.normal(size=(n_draws, n, *shape))
-        places["place_bound"] = 0.1 * rng.normal(size=(n_draws, n, 8, *shape))
+        places["place"] = 0.03 * rng.normal(size=(n_draws, n, *shape))
+        places["place_bound"] = 0.03 * rng.normal(size=(n_draws, n, 8, *shape))
 
     if model == "coupled":
         B0 = rng.uniform(0.0, 0.15, (n_draws, n_robots, n_robots))
         B0 += 0.4 * np.eye(n_robots)
-        B = 0.1 * rng.normal(size=(n_draws, 2, n_robots, n_robots))
-        root_w, root_v = 0.1 * rng.normal(size=(2, n_draws, n_robots, n_robots))
-        own = 0.02 * np.eye(n_robots)
+        B = 0.05 * rng.normal(size=(n_draws, 2, n_robots, n_robots))
+        root_w, root_v = 0.06 * rng.normal(size=(2, n_draws, n_robots, n_robots))
+        own = 0.005 * np.eye(n_robots)
         b = rng.uniform(0.1, 0.2, (n_draws, n_robots))
         noises = root_w @ root_w.mT + own, root_v @ root_v.mT + own
         return CoupledParams(B0, B, b, *noises, *x0, **places)
 
     memory = "deviation" if "deviation" in words else "level"
     gain = 1.0 if memory == "deviation" else 1.0 - beta0
-    beta = rng.uniform(0.0, 0.4, (n_draws, 2))
+    beta = rng.uniform(0.0, 0.25, (n_draws, 2))
     noises = rng.uniform(0.05, 0.2, (2, n_draws))
     options = {"memory": memory, **places}
     if "shared noise" in words:
@@ -92,7 +92,7 @@ def draws_of(kind, *, n_draws=3, n_robots=3, shape=GRID, seed=0):
 
     beta0 = rng.uniform(0.2, 0.8, (n_draws, n_robots))
     gain = np.ones_like(beta0) if memory == "deviation" else 1.0 - beta0
-    beta = gain[..., None] * rng.uniform(0.0, 0.4, (n_draws, n_robots, 2))
+    beta = gain[..., None] * rng.uniform(0.0, 0.25, (n_draws, n_robots, 2))
     noises = rng.uniform(0.05, 0.2, (2, n_draws, n_robots))
     return RobotParams(beta0, beta, 0.3 * gain, *noises, *x0, **options)
 

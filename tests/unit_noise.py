@@ -32,6 +32,21 @@ class UnitNoise:
         return moments_of(values)
 
 
+class Unit:
+    """Generator of a single point whose number with the given index is 1, and all others are 0."""
+
+    def __init__(self, index=None):
+        self.left = -1 if index is None else index
+
+    def standard_normal(self, size):
+        """Numbers of this shape."""
+        numbers = np.zeros(int(np.prod(size)))
+        if 0 <= self.left < numbers.size:
+            numbers[self.left] = 1.0
+        self.left -= numbers.size
+        return numbers.reshape(size)
+
+
 def moments_of(values):
     """Mean and covariance of draws, from the values (point, ...) without noise and at each unit."""
     values = np.reshape(values, (len(values), -1))

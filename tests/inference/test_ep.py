@@ -1,88 +1,112 @@
-"""Expectation propagation against quadrature over all linear predictors of small cases."""
+"""Expectation propagation against quadrature over the linear predictors of small cases."""
 
 import numpy as np
 import pytest
-from scipy.special import logsumexp
+from dense_coefficients import DenseRates
+from dense_families import by_quadrature, of_one_report, with_one_limit
+from every_model import FEATURES, GRID, models_of
 
-from trustbo.inference import ep
-from trustbo.inference.density import Density, at
-from trustbo.models import HumanTrust, PooledTrust
+from trustbo.inference.density import Density
+from trustbo.models import HumanTrust
 from trustbo.models.observations import Observations
+from trustbo.models.visited import visited
 
-FEATURES = ("vegetation",)
+N_TICKS = 40
+OUTCOMES = ("success", "failure", "demand")
+PAIRS = [(1.0, 0.6), (1.0, 1.0), (0.0, 1.0), (0.4, np.nan)]
+MODELS = {
+    "pooled": (1, 2, 1),  # two bounds of a robot
+    "pooled, deviation, robots": (1, 2, 1),
+    "hierarchical": (1, 1, 2),  # two robots in a bound
+    "coupled, places": (1, 1, 2),
+}
 
 
-def small(family, y):
-    """One robot, one mission, two bounds."""
-    y = np.array(y, dtype=float).reshape(1, 2, 1)
-    z = np.array([0.3, 0.8]).reshape(1, 2, 1, 1)
-    model = PooledTrust(family=family).for_features(FEATURES)
-    return Density(model, Observations(y, z, np.full(y.shape, 40.0), FEATURES))
-
-
-def by_quadrature(posterior, theta):
-    """Log p(rates | theta) by a grid over both linear predictors, coefficients integrated out."""
-    predictor, prior = posterior._at(theta)
-    U = posterior.blocks.U.toarray()
-    c_cov = np.diag(1.0 / np.concatenate([part[0] for part in prior.parts]))
-    T = predictor.response[0, 0]
-    mean = predictor.mean[0, 0] + T @ U @ prior.mean[0]
-    cov = predictor.covariance[0, 0] + T @ U @ c_cov @ U.T @ T.T
-    L, e = np.linalg.cholesky(cov), np.linspace(-8.0, 8.0, 801)
-    a, b = np.meshgrid(e, e, indexing="ij")
-    f = mean[:, None, None] + np.stack([L[0, 0] * a, L[1, 0] * a + L[1, 1] * b])
-    rates, total = posterior.rates, -0.5 * (a**2 + b**2) - np.log(2.0 * np.pi)
-    for k in range(2):
-        if not np.isnan(rates.y[0, k]):
-            sd = predictor.noise_sd[0, 0, 0]
-            total = total + rates.likelihood.log_prob(rates.y[0, k], 40.0, f[k], sd)
-    return logsumexp(total) + 2.0 * np.log(e[1] - e[0])
+def small(name, family, y):
+    """Density of two rates, its only scores, and the log evidence there by quadrature."""
+    shape = MODELS[name]
+    rng = np.random.default_rng(2)
+    bounds = np.stack([rng.integers(0, n, shape[:2]) for n in (8, *GRID)], axis=-1)
+    observations = Observations(
+        np.reshape(y, shape), rng.uniform(size=(*shape, 2)), np.full(shape, float(N_TICKS)),
+        FEATURES, visited(bounds, GRID),
+    )  # fmt: skip
+    model = models_of(family)[name].for_features(FEATURES)
+    posterior = Density(model, observations)
+    z = np.full((1, posterior.n_scores), -0.2)
+    dense = DenseRates(model, observations, posterior.theta(z), bounds)
+    moments = dense.mean[0], dense.cov[0], dense.noise[0]
+    return posterior, z, by_quadrature(family, *moments, dense.y, N_TICKS)
 
 
 @pytest.mark.parametrize("family", ["censored", "beta_binomial"])
-@pytest.mark.parametrize("y", [(1.0, 0.6), (1.0, 1.0), (0.0, 1.0), (0.4, np.nan)])
-def test_the_evidence_and_the_mean_weight_are_those_of_quadrature(family, y):
-    posterior = small(family, y)
-    theta = posterior.theta(np.array([[0.0, -0.5, 0.2]]))
+@pytest.mark.parametrize("y", PAIRS)
+@pytest.mark.parametrize("name", MODELS)
+def test_the_evidence_is_that_of_quadrature(name, family, y):
+    posterior, z, wanted = small(name, family, y)
+    theta = posterior.theta(z)
     posterior.run_ep(theta)
-    wanted = by_quadrature(posterior, theta)
-    found, _ = ep.log_evidence(posterior._joint(theta), posterior.sites, 10)
-    assert abs(found[0] - wanted) < 0.05  # EP's own error
-    many = at(theta, np.zeros(20_000, int))
-    joint = posterior._joint(many)
-    sites = ep.Sites(*(np.repeat(s, 20_000, axis=0) for s in posterior.sites)).at(
-        posterior.rates, joint.predictor.noise_sd
-    )
-    _, _, log_weight = ep.draw(joint, sites, np.random.default_rng(0))
-    weight = np.exp(log_weight - wanted)
-    assert abs(weight.mean() - 1.0) < 5.0 * weight.std() / np.sqrt(len(weight)) + 2e-3
+    assert abs(posterior.log_evidence(theta)[0] - wanted) < 0.05  # EP's own error
 
 
-def test_gaussian_terms_alone_leave_the_evidence_exact():
-    exact = small("gaussian", (0.4, 0.6))
-    censored = small("censored", (0.4, 0.6))
-    z = np.random.default_rng(0).standard_normal((5, 3))
-    theta = exact.theta(z)
-    np.testing.assert_allclose(
-        censored.log_evidence(theta), exact.log_evidence(theta), rtol=0, atol=1e-9
-    )
+@pytest.mark.parametrize("family", ["censored", "beta_binomial"])
+@pytest.mark.parametrize(("name", "y"), [("pooled", PAIRS[0]), ("coupled, places", PAIRS[2])])
+def test_the_mean_weight_of_draws_is_that_of_quadrature(name, family, y):
+    n = 2000
+    posterior, z, wanted = small(name, family, y)
+    posterior.run_ep(posterior.theta(z))
+    many = np.repeat(z, n, axis=0)
+    log_p = posterior.scores.log_prior(many) + wanted
+    _, log_weight = posterior.draw_by_ep(many, log_p, np.random.default_rng(0), 1)
+    weight = np.exp(log_weight)
+    assert abs(weight.mean() - 1.0) < 5.0 * weight.std() / np.sqrt(n) + 2e-3
 
 
-def test_parts_of_persons_have_their_joint_law():
-    """Their sum of squares in trust is a term of the block's covariance."""
-    y = np.full((3, 4, 1), np.nan)
-    z = np.random.default_rng(0).integers(0, 2, (3, 4, 1, 2)).astype(float)
-    features = ("success", "failure")
-    model = HumanTrust(scale="likert7").for_features(features)
-    observations = Observations(y, z, np.full(y.shape, 6.0), features)
+def people(scale, change=None):
+    """Density of reports of persons, three thetas, and the dense reference."""
+    rng = np.random.default_rng(0)
+    z = rng.integers(0, 2, (3, 4, 2, 3)).astype(float)
+    z[..., 2] = rng.uniform(size=z.shape[:3])
+    y = rng.uniform(0.1, 0.9, (3, 4, 2))
+    y[rng.random(y.shape) < 0.2] = np.nan
+    if change is not None:
+        change(y)
+
+    model = HumanTrust(scale=scale).for_features(OUTCOMES)
+    observations = Observations(y, z, np.full(y.shape, 6.0), OUTCOMES)
     posterior = Density(model, observations)
-    theta = posterior.theta(np.zeros((1, posterior.n_scores)))
-    with_parts = model.linear_predictor(theta, observations, posterior.layout).trust_cov
-    effects = model.random_effects(theta, observations)
-    parts = model.state_space(theta, 1).response(4) @ effects.drift + effects.offset
-    rest = with_parts - parts @ np.swapaxes(parts, 2, 3)
-    beta0, delta_w = theta["beta0"][0], theta["delta_w"][0]
-    lag = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
-    var = delta_w**2 * np.cumsum(beta0 ** (2 * np.arange(4)))
-    wanted = beta0**lag * np.minimum.outer(var, var)
-    np.testing.assert_allclose(rest[0], np.broadcast_to(wanted, rest[0].shape), rtol=1e-9)
+    theta = posterior.theta(0.5 * rng.standard_normal((3, posterior.n_scores)))
+    return posterior, theta, DenseRates(model, observations, theta)
+
+
+def test_the_evidence_of_reports_inside_the_scale_is_the_density_of_the_joint_normal():
+    """Outcomes are carried over, the base level is not, and each person has parts of their own."""
+    posterior, theta, dense = people("unit")
+    found = posterior.log_evidence(theta)
+    np.testing.assert_allclose(found, dense.log_density(), rtol=1e-9)
+
+
+@pytest.mark.parametrize("limit", [0.0, 1.0])
+def test_the_evidence_with_one_report_at_an_end_has_the_normal_tail_beyond_it(limit):
+    def change(y):
+        y[1, 2, 0] = limit
+
+    posterior, theta, dense = people("unit", change)
+    cov = dense.cov + dense.noise
+    expected = [with_one_limit(*moments, dense.y) for moments in zip(dense.mean, cov, strict=True)]
+    np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("level", [0, 2, 6])
+def test_the_evidence_of_one_report_on_a_scale_of_levels_is_its_probability(level):
+    def change(y):
+        y[:] = np.nan
+        y[1, 2, 0] = level / 6.0
+
+    posterior, theta, dense = people("likert7", change)
+    [at] = np.flatnonzero(~np.isnan(dense.y))
+    expected = [
+        of_one_report(dense.mean[p, at], dense.cov[p, at, at], level, 7, theta["delta_v"][p])
+        for p in range(3)
+    ]
+    np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-9)

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import xarray as xr
+from dense_families import likelihood, on_a_grid, trust_with_one_limit, with_one_limit
+from dense_statespace import mission_of_params, trust_of_params
+from every_model import KINDS, draws_of
 from missions import N_TICKS, OF_FAMILY, counted_missions, random_params
-from references import dense_log_likelihood, dense_posterior_of_trust, on_a_grid
 from scipy import stats
 
 import trustbo as tb
@@ -22,36 +24,97 @@ def posterior(missions):
 def mixture(n_draws=4, seed=0):
     rng = np.random.default_rng(seed)
     draws = [random_params(rng) for _ in range(n_draws)]
-    return draws, TrustParams(*(np.stack(v) for v in zip(*(d[:7] for d in draws), strict=True)))
+    return TrustParams(*(np.stack(v) for v in zip(*(d[:7] for d in draws), strict=True)))
 
 
-def test_after_each_bound_trust_is_its_exact_posterior():
-    draws, params = mixture()
-    rng = np.random.default_rng(1)
-    z, y = rng.uniform(size=(6, 3, 2)), rng.uniform(size=(6, 3))
-    y[2, 1] = np.nan
+PATH = [(0, 0), (1, 1), (1, 2), (2, 1), (2, 2)]
+
+
+def mission_seen(n_robots=3, seed=1):
+    """Awareness and rates along `PATH`, some of which were not measured."""
+    rng = np.random.default_rng(seed)
+    shape = len(PATH) - 1, n_robots
+    z, y = rng.uniform(size=(*shape, 2)), rng.uniform(0.05, 0.95, shape)
+    y[1, 0] = np.nan
+    y[2] = np.nan
+    return z, y
+
+
+def averaged(weight, means, sds):
+    """Mean and standard deviation over weighted draws."""
+    mean = weight @ means
+    return mean, np.sqrt(weight @ (np.square(sds) + (means - mean) ** 2))
+
+
+def weights_of(log_density):
+    weight = np.exp(log_density - np.max(log_density))
+    return weight / weight.sum()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_after_each_bound_trust_is_its_exact_posterior(kind):
+    params = draws_of(kind)
+    z, y = mission_seen()
+    dense = [mission_of_params(params.draw(i), z, PATH) for i in range(3)]
     live = TrustFilter(params, n_robots=3)
-    for k in range(1, 7):
-        state = live.update(z[k - 1], y[k - 1])
-        log_weight = [
-            sum(dense_log_likelihood(*p[:7], z[:k, i], y[:k, i]) for i in range(3)) for p in draws
-        ]
-        weight = np.exp(log_weight - np.max(log_weight))
-        weight /= weight.sum()
-        np.testing.assert_allclose(live.weights, weight, rtol=1e-8)
-        for i in range(3):
-            moments = [dense_posterior_of_trust(*p[:7], z[:k, i], y[:k, i]) for p in draws]
-            means = np.array([m[-1] for m, _ in moments])
-            variances = np.array([v[-1, -1] for _, v in moments])
-            mean = weight @ means
-            np.testing.assert_allclose(state.mean[i], mean, rtol=1e-8)
-            sd = np.sqrt(weight @ (variances + (means - mean) ** 2))
-            np.testing.assert_allclose(state.sd[i], sd, rtol=1e-7)
-    assert live.n_bounds == 6
+    for k in range(len(z)):
+        state = live.update(z[k], y[k], PATH[k : k + 2])
+        until = np.where(np.arange(len(z))[:, None] <= k, y, np.nan)
+        weight = weights_of([one.log_density(until) for one in dense])
+        given = [one.trust_given(until) for one in dense]
+        now = slice(3 * k, 3 * k + 3)
+        means = np.array([mean[now] for mean, _ in given])
+        sds = np.array([np.sqrt(np.diag(cov)[now]) for _, cov in given])
+        mean, sd = averaged(weight, means, sds)
+        np.testing.assert_allclose(live.weights, weight, rtol=1e-9)
+        np.testing.assert_allclose(state.mean, mean, rtol=1e-9)
+        np.testing.assert_allclose(state.sd, sd, rtol=1e-9)
+    assert live.n_bounds == len(z)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_trust_ahead_is_that_of_the_joint_normal(kind):
+    params = draws_of(kind)
+    z, y = mission_seen()
+    y[2:] = np.nan
+    live = TrustFilter(params, n_robots=3)
+    for k in range(2):
+        live.update(z[k], y[k], PATH[k : k + 2])
+    ahead = live.predict(z[2:], PATH[2:])
+
+    dense = [mission_of_params(params.draw(i), z, PATH) for i in range(3)]
+    weight = weights_of([one.log_density(y) for one in dense])
+    given = [one.trust_given(y) for one in dense]
+    means = np.array([mean for mean, _ in given])
+    sds = np.array([np.sqrt(np.diag(cov)) for _, cov in given])
+    mean, sd = averaged(weight, means, sds)
+    np.testing.assert_allclose(ahead.mean.ravel(), mean[6:], rtol=1e-9)
+    np.testing.assert_allclose(ahead.sd.ravel(), sd[6:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("limit", [0.0, 1.0])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_censored_rate_after_others_inside_is_followed_exactly(kind, limit):
+    """Moments are matched, which is exact for the last rate, that of the last robot."""
+    params = draws_of(kind)
+    z, y = mission_seen()
+    y[-1, -1] = limit
+    live = TrustFilter(params, n_robots=3, family="censored")
+    for k in range(len(z)):
+        state = live.update(z[k], y[k], PATH[k : k + 2])
+
+    flat = y.ravel()
+    dense = [mission_of_params(params.draw(i), z, PATH) for i in range(3)]
+    weight = weights_of([with_one_limit(one.mean, one.rate_cov, flat) for one in dense])
+    given = [trust_with_one_limit(*one, flat) for one in dense]
+    mean, sd = averaged(weight, *(np.array([one[i][-3:] for one in given]) for i in (0, 1)))
+    np.testing.assert_allclose(live.weights, weight, rtol=1e-9)
+    np.testing.assert_allclose(state.mean, mean, rtol=1e-9)
+    np.testing.assert_allclose(state.sd, sd, rtol=1e-9)
 
 
 def test_predicting_is_updating_with_nothing_measured():
-    _, params = mixture()
+    params = mixture()
     rng = np.random.default_rng(2)
     z = rng.uniform(size=(5, 3, 2))
     live = TrustFilter(params, n_robots=3)
@@ -79,7 +142,7 @@ def test_a_posterior_brings_its_robots_and_a_reset_starts_over(posterior):
 
 
 def test_bad_input_is_named():
-    _, params = mixture()
+    params = mixture()
     with pytest.raises(TrustboError, match="got None"):
         TrustFilter(None)
     with pytest.raises(TrustboError, match="n_robots"):
@@ -103,7 +166,7 @@ def test_bad_input_is_named():
 
 def test_impossible_values_leave_the_filter_as_it_was(posterior):
     """Trust of 44 is what a filter says that takes 85 for the contact of a tick."""
-    _, params = mixture()
+    params = mixture()
     live, good = TrustFilter(params, n_robots=3), np.full((3, 2), 0.5)
     with pytest.raises(TrustboError, match=r"awareness: \[0, 0\] = 80 is outside"):
         live.update(good * 160, [0.5] * 3)
@@ -124,7 +187,7 @@ def test_impossible_values_leave_the_filter_as_it_was(posterior):
 
 
 def test_bounds_that_cannot_be_are_named():
-    _, params = mixture()
+    params = mixture()
     params = params._replace(place=np.zeros((4, 1, 5, 6)))
     live, z, y = TrustFilter(params, n_robots=3), np.full((3, 2), 0.5), [0.5] * 3
     for bound, message in {
@@ -150,18 +213,32 @@ def constant(p, n=2):
 
 @pytest.mark.parametrize("family", ["censored", "beta_binomial"])
 def test_families_are_followed_to_the_trust_of_a_grid(family):
-    """Moments are matched bound by bound: within .05 sd of the exact posterior."""
+    """Moments are matched bound by bound: within .05 sd of the exact posterior.
+
+    The weight of a draw is compared with that of one whose trust has no noise.
+    """
     p = OF_FAMILY[family]
+    other = p._replace(delta_w=1e-5, x0_sd=1e-5)
     z, y, _ = counted_missions(family)
     live = TrustFilter(constant(p), n_robots=1, family=family)
+    two = TrustParams(*(np.stack(pair) for pair in zip(p[:7], other[:7], strict=True)))
+    compared = TrustFilter(two, n_robots=1, family=family)
     for j in range(len(y)):
         live.reset()
+        compared.reset()
         for k in range(5):
             state = live.update(z[j, k], y[j, k], n_ticks=N_TICKS)
-        expected, mean, sd = on_a_grid(family, p, z[j, :, 0], y[j, :, 0], last_trust=True)
+            compared.update(z[j, k], y[j, k], n_ticks=N_TICKS)
+        expected, mean, sd = on_a_grid(family, p, z[j, :, 0], y[j, :, 0], n_ticks=N_TICKS)
         assert abs(state.mean[0] - mean) < 0.05 * sd
         assert abs(state.sd[0] / sd - 1.0) < 0.05
-        assert abs(live._log_weight[0] - expected) < 0.03
+        trust = trust_of_params(other, z[j])[:, 0]
+        of_other = sum(
+            np.log(likelihood(family, y[j, k, 0], N_TICKS, trust[k], other.delta_v))
+            for k in np.flatnonzero(~np.isnan(y[j, :, 0]))
+        )
+        ratio = np.log(compared.weights[0] / compared.weights[1])
+        assert abs(ratio - (expected - of_other)) < 0.03
 
 
 def test_counts_need_their_numbers_of_ticks():

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import numpyro.distributions as dist
 import pytest
+from dense_statespace import equations_of_params, mission_of, mission_of_params
 from missions import draw_rates
-from references import dense_log_likelihood
 from scipy import stats
 
 import trustbo as tb
@@ -102,30 +102,25 @@ def test_likelihoods_are_those_of_a_chain_of_deviations(deviations):
     d = posterior["robots"]["robot_effect"].values[0, 7]
     params = tb.inference.params_of(posterior)
     assert params.memory == "deviation"
-    noises = float(draws["delta_w"]), float(draws["delta_v"])
+    of_draw = params.draw(7)._replace(beta=draws["beta"].values, b=float(draws["b"]))
     for j, mission in enumerate(deviations):
-        place = params.draw(7).of_places(tb.workspace.moves.bounds_along(mission.path))
-        z, expected = mission.awareness, 0.0
-        for i in range(3):
-            u = z[:, i] @ draws["beta"].values + float(draws["b"])
-            u = u + d[j, i] * z[:, i, 0] + place[0]
-            y = mission.contact_rate[:, i] - u
-            no = np.zeros((len(y), 1))
-            beta0 = float(draws["beta0"])
-            expected += dense_log_likelihood(beta0, [0.0], 0.0, *noises, 0.0, 0.5, no, y)
+        form, drift, offset = equations_of_params(of_draw, mission.awareness, mission.path)
+        offset = offset + d[j] * mission.awareness[..., 0]
+        expected = mission_of(form, drift, offset).log_density(mission.contact_rate)
         found = posterior["log_likelihood"]["contact_rate"].values[0, 7, j]
-        np.testing.assert_allclose(found, expected, rtol=1e-8)
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_scores_are_of_deviations_that_last(deviations):
     """The log score of a rate ahead, against its marginal normal under each draw."""
-    posterior = tb.fit(deviations, PooledTrust(memory="deviation"), draws=25, progress=False)
+    model = PooledTrust(memory="deviation")
+    posterior = tb.fit(deviations, model, draws=25, chains=1, progress=False)
     params = tb.inference.params_of(posterior)
     table = tb.inference.score(posterior, deviations)
-    k, y = np.arange(1, 13), deviations[2].contact_rate[:, 1]
-    beta0, w, v = (x[:, None] for x in (params.beta0, params.delta_w, params.delta_v))
-    mean = params.beta @ deviations[2].awareness[:, 1].T + params.b[:, None]
-    lasting = beta0 ** (2 * k)
-    variance = lasting * 0.5**2 + w**2 * (1.0 - lasting) / (1.0 - beta0**2) + v**2
-    density = stats.norm.pdf(y, mean, np.sqrt(variance)).mean(0)
-    np.testing.assert_allclose(table["log_score"][2, :, 1], np.log(density), rtol=1e-6)
+    densities = []
+    for i in range(25):
+        dense = mission_of_params(params.draw(i), deviations[2].awareness)
+        sd = np.sqrt(np.diag(dense.rate_cov))
+        densities.append(stats.norm.pdf(deviations[2].contact_rate.ravel(), dense.mean, sd))
+    expected = np.log(np.mean(densities, axis=0))
+    np.testing.assert_allclose(np.ravel(table["log_score"][2]), expected, rtol=1e-9)

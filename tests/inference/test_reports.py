@@ -2,15 +2,13 @@
 
 import numpy as np
 import pytest
-from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve
+from dense_coefficients import DenseRates
 
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import fit, loo, predict_reports
-from trustbo.inference.density import at
-from trustbo.inference.draws import read_posterior
 from trustbo.models import HumanTrust, PooledTrust
+from trustbo.models.observations import Observations
 
 FEATURES = ["success", "failure", "demand"]
 DIMS = ("chain", "draw")
@@ -69,26 +67,22 @@ def test_predictions_are_those_of_the_joint_normal_of_draws():
     new = tb.Mission.from_arrays(None, new.awareness, y, features=FEATURES)
     found = predict_reports(posterior, [new], n_draws=400)
 
-    fitted, draws = read_posterior(posterior)
-    observations = fitted.model.observations([new])
-    effects = zip(fitted.model.terms, strict=True)
-    U = np.column_stack([effect.design(observations).toarray() for (effect,) in effects])
-    log_w, means = [], []
-    for i in range(len(draws.c)):
-        theta = at(draws.theta, slice(i, i + 1))
-        predictor = fitted.model.linear_predictor(
-            theta, observations, fitted.model.layout(observations)
-        )
-        inputs = fitted.model.layout(observations).design(sparse.csr_array(U)) @ draws.c[i]
-        mean = (predictor.mean[0, 0] + predictor.response[0, 0] @ inputs.ravel()).ravel()
-        S = predictor.covariance[0, 0]
-        C = S[:4, :4] + float(predictor.noise_sd[0].ravel()[0]) ** 2 * np.eye(4)
-        off, factor = y[:4, 0] - mean[:4], cho_factor(C)
-        white = cho_solve(factor, off)
-        log_w.append(-0.5 * off @ white - np.log(np.diag(factor[0])).sum())
-        means.append(mean[4] + S[4, :4] @ white)
-    w = np.exp(np.array(log_w) - np.max(log_w))
-    expected = (w / w.sum()) @ np.array(means)
+    # The weights of each draw are known, and the parts of the person are not.
+    draws = {
+        name: array.values.reshape(-1, *array.shape[2:])
+        for name, array in posterior["posterior"].to_dataset().items()
+    }
+    observations = Observations.from_missions([new])
+    dense = DenseRates(HumanTrust().for_features(FEATURES), observations, draws)
+    known = len(FEATURES) + 1
+    dense.prior_mean[:, :known] = np.column_stack([draws["beta"], draws["b"]])
+    dense.prior_cov[:, :known] = 0.0
+    dense.prior_cov[:, :, :known] = 0.0
+
+    log_w = dense.log_density()
+    mean, _ = dense.new_rates()
+    w = np.exp(log_w - log_w.max())
+    expected = (w / w.sum()) @ mean[:, 4]
     assert float(found["mean"][0, 4, 0]) == pytest.approx(expected, abs=0.03)
 
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from dense_coefficients import DenseRates
+from dense_statespace import mission_of_params
 from missions import (
     N_TICKS,
     OF_FAMILY,
@@ -10,26 +12,34 @@ from missions import (
     simulate_missions,
     walking_missions,
 )
-from references import DenseOfPlaces, dense_joint
 from scipy import stats
 
 import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import fit, params_of, score
-from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, Priors
+from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust
+from trustbo.models.observations import Observations
+from trustbo.workspace.moves import bounds_along
 
 SHAPE = (5, 5)
 
 
 def conditioned(missions, theta):
-    """Mean and sd of the rates of the last mission given the others, (bound, robot)."""
-    joint = DenseOfPlaces(missions, PlaceEffect(), theta, Priors())
-    n = len(joint.off) - missions[-1].contact_rate.size
-    gain = np.linalg.solve(joint.cov[:n, :n], joint.cov[:n, n:]).T
-    mean = missions[-1].contact_rate.T.ravel() - joint.off[n:] + gain @ joint.off[:n]
-    cov = joint.cov[n:, n:] - gain @ joint.cov[:n, n:]
-    return [a.reshape(3, -1).T for a in (mean, np.sqrt(np.diag(cov)))]
+    """Mean and sd (point, bound, robot) of the rates of the last mission given the others."""
+    observations = Observations.from_missions(missions)
+    last = np.arange(len(missions)) == len(missions) - 1
+    observations.contact_rate[last] = np.nan
+    bounds = np.full((*observations.contact_rate.shape[:2], 3), -1)
+    for j, mission in enumerate(missions):
+        bounds[j, : len(mission.bounds)] = bounds_along(mission.path)
+
+    joint = DenseRates(PooledTrust(effects=PlaceEffect()), observations, theta, bounds)
+    mean, cov = joint.new_rates()
+    sd = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    n_bounds = len(missions[-1].bounds)
+    shape = len(mean), *observations.contact_rate.shape
+    return [moment.reshape(shape)[:, -1, :n_bounds] for moment in (mean, sd)]
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +50,8 @@ def placed():
     posterior = fit(missions[:-1], PooledTrust(effects=place), workspace=workspace)
     draws = posterior["posterior"].to_dataset()
     names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
-    theta = np.column_stack([draws[name].values.ravel() for name in names])
-    moments = [conditioned(missions, t) for t in theta[::10]]
-    return missions, posterior, *np.moveaxis([list(m) for m in moments], 1, 0)
+    theta = {name: draws[name].values.ravel()[::10] for name in names}
+    return missions, posterior, *conditioned(missions, theta)
 
 
 def test_a_prediction_is_the_joint_normal_given_earlier_missions_averaged_over_draws(placed):
@@ -105,16 +114,11 @@ def test_log_scores_of_robots_that_differ_are_marginals_of_their_joint_normal(mo
     params = params_of(posterior).flat()
     y, densities = missions[4].contact_rate, []
     for t in range(len(params.b)):
-        p = params.draw(t)
-        if hasattr(p, "B0"):
-            drift, B0, Q, R = np.einsum("kim,mai->ka", z, p.B) + p.b, p.B0, p.Delta_w, p.Delta_v
-        else:
-            drift = np.einsum("kim,im->ki", z, p.beta) + p.b
-            B0, Q, R = np.diag(p.beta0), np.diag(p.delta_w**2), np.diag(p.delta_v**2)
-        joint = dense_joint(B0, drift, Q, R, float(p.x0_mean), float(p.x0_sd))
-        densities.append(stats.norm.pdf(y.ravel(), joint.mean_y, np.sqrt(np.diag(joint.cov_y))))
+        dense = mission_of_params(params.draw(t), z)
+        sd = np.sqrt(np.diag(dense.rate_cov))
+        densities.append(stats.norm.pdf(y.ravel(), dense.mean, sd))
     expected = np.log(np.mean(densities, axis=0)).reshape(y.shape)
-    np.testing.assert_allclose(scores["log_score"][0], expected, rtol=1e-8)
+    np.testing.assert_allclose(scores["log_score"][0], expected, rtol=1e-9)
 
 
 def test_pit_of_rates_that_the_model_draws_are_uniform_with_limits_of_censored_ones():

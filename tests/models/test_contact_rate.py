@@ -1,33 +1,110 @@
 """Contact rates given any drift, of programs of users."""
 
+from itertools import product
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import pytest
+from dense_statespace import form_of, mission_of
 from numpyro import handlers
+from scipy.linalg import block_diag
+from unit_noise import UnitNoise
 
 from trustbo.errors import TrustboError
 from trustbo.models import ContactRate
+from trustbo.models.backend import own_settings
 
-X0 = 0.4, 0.6
+N_ROBOTS = 3
+RNG = np.random.default_rng(0)
+DRIFT, OFFSET = RNG.uniform(-0.3, 0.5, (2, 2, 4, N_ROBOTS))
+RATES = RNG.uniform(size=DRIFT.shape)
+RATES[0, 2, 1] = RATES[1, 3] = np.nan
+ROOT = 0.2 * RNG.normal(size=(2, N_ROBOTS, N_ROBOTS)) + 0.3 * np.eye(N_ROBOTS)
+SHAPES = {
+    "number": {"beta0": 0.6, "delta_w": 0.2, "delta_v": 0.1},
+    "robot": {
+        "beta0": np.array([0.2, 0.5, 0.9]),
+        "delta_w": np.array([0.1, 0.2, 0.3]),
+        "delta_v": np.array([0.3, 0.2, 0.1]),
+    },
+    "matrix": {
+        "beta0": RNG.uniform(-0.2, 0.5, (N_ROBOTS, N_ROBOTS)),
+        "delta_w": ROOT[0] @ ROOT[0].T,
+        "delta_v": ROOT[1] @ ROOT[1].T,
+    },
+}
+X0 = {"x0_mean": np.array([0.4, 0.5, 0.7]), "x0_sd": np.array([0.6, 0.0, 0.2])}
+LAWS = list(product(SHAPES, SHAPES, SHAPES, (None, 0.25)))
 
 
-def test_rates_that_are_drawn_have_the_moments_of_equations_3_and_4():
-    """Of each robot's own parameters, in closed form, within 5 standard errors of 20 000 draws."""
-    beta0, delta_w, delta_v = np.array([0.5, 0.9]), 0.1, np.array([0.05, 0.2])
-    drift = np.array([[[0.2, 0.1], [0.3, -0.1]]])
-    law = ContactRate(jnp.asarray(drift), beta0, delta_w, delta_v, *X0)
+def law_of(of_beta0, of_delta_w, of_delta_v, delta_s, **options):
+    """`ContactRate` with parameters of these shapes, and the dense normal of each mission."""
+    shapes = {"beta0": of_beta0, "delta_w": of_delta_w, "delta_v": of_delta_v}
+    given = {name: SHAPES[shape][name] for name, shape in shapes.items()}
+    law = ContactRate(DRIFT, **given, **X0, offset=OFFSET, delta_s=delta_s, **options)
+    form = form_of(**given, **X0, n_robots=N_ROBOTS, delta_s=delta_s or 0.0)
+    return law, [mission_of(form, u, o) for u, o in zip(DRIFT, OFFSET, strict=True)]
+
+
+@pytest.mark.parametrize(("of_beta0", "of_delta_w", "of_delta_v", "delta_s"), LAWS)
+def test_the_density_is_that_of_the_joint_normal(of_beta0, of_delta_w, of_delta_v, delta_s):
+    with own_settings():
+        law, dense = law_of(of_beta0, of_delta_w, of_delta_v, delta_s)
+        found = law.log_prob(RATES)
+    expected = [one.log_density(y) for one, y in zip(dense, RATES, strict=True)]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("shapes", LAWS[::7])
+def test_rates_are_drawn_from_the_joint_normal(shapes, monkeypatch):
+    """Of unit vectors instead of normal numbers; the numbers of missions differ."""
+    rng = UnitNoise()
+    monkeypatch.setattr(
+        jax.random, "normal", lambda key, shape: jnp.asarray(rng.standard_normal(shape))
+    )
+    with own_settings():
+        law, dense = law_of(*shapes)
+        drawn = np.asarray(law.sample(jax.random.key(0), (1 + 4 * DRIFT.size,)))
+
+    mean, cov = rng.moments(drawn)
+    np.testing.assert_allclose(mean, np.concatenate([one.mean for one in dense]), rtol=1e-9)
+    expected = block_diag(*(one.rate_cov for one in dense))
+    np.testing.assert_allclose(cov, expected, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("delta_s", [None, 0.25])
+def test_many_drawn_rates_have_the_moments_of_the_joint_normal(delta_s):
+    """Within 5 standard errors of 20 000 draws, without a change of the generator."""
     n = 20_000
-    rates = np.asarray(law.sample(jax.random.key(0), (n,)))
-    assert rates.shape == (n, 1, 2, 2)
-    mean, var = np.full(2, X0[0]), np.full(2, X0[1] ** 2)
-    for k in range(2):
-        mean, var = beta0 * mean + drift[0, k], beta0**2 * var + delta_w**2
-        total = var + delta_v**2
-        y = rates[:, 0, k]
-        assert (np.abs(y.mean(0) - mean) < 5.0 * np.sqrt(total / n)).all()
-        assert (np.abs(y.var(0) / total - 1.0) < 5.0 * np.sqrt(2.0 / n)).all()
+    with own_settings():
+        law, dense = law_of("robot", "number", "robot", delta_s)
+        rates = np.asarray(law.sample(jax.random.key(0), (n,)))
+    assert rates.shape == (n, *DRIFT.shape)
+    for j, one in enumerate(dense):
+        y = rates[:, j].reshape(n, -1)
+        sd = np.sqrt(np.diag(one.rate_cov))
+        assert (np.abs(y.mean(0) - one.mean) < 5.0 * sd / np.sqrt(n)).all()
+        error = (np.cov(y.T) - one.rate_cov) / np.outer(sd, sd)
+        assert (np.abs(error) < 5.0 * np.sqrt(2.0 / n)).all()
+
+
+def test_with_numbers_of_ticks_it_has_the_probability_of_counts():
+    n_ticks = np.full(RATES.shape, 20.0)
+    n_ticks[1] = 50.0
+    some = n_ticks.copy()
+    some[0, 0, 0] = np.nan  # then all are densities
+    n_ticks[np.isnan(RATES)] = np.nan
+    with own_settings():
+        counted, dense = law_of("robot", "number", "number", None, n_ticks=n_ticks)
+        uncounted, _ = law_of("robot", "number", "number", None, n_ticks=some)
+        found = np.stack([law.log_prob(RATES) for law in (counted, uncounted)])
+
+    density = np.array([one.log_density(y) for one, y in zip(dense, RATES, strict=True)])
+    n_seen = (~np.isnan(RATES)).sum((1, 2))
+    expected = density - n_seen * np.log([20.0, 50.0])
+    np.testing.assert_allclose(found, [expected, density], rtol=1e-9)
 
 
 def test_a_model_of_ones_own_is_a_numpyro_program():

@@ -2,6 +2,11 @@
 
 import numpy as np
 import pytest
+from dense_statespace import mission_of_params
+from every_model import KINDS, draws_of
+from scipy import stats
+from scipy.special import expit
+from unit_noise import Unit, moments_of
 
 import trustbo as tb
 from trustbo.errors import TrustboError
@@ -18,18 +23,49 @@ def workspace():
     return tb.Workspace.from_awareness(np.random.default_rng(0).uniform(size=(3, 2, 4, 2)))
 
 
-def test_rates_have_the_moments_of_the_state_space(workspace):
-    simulator = ModelSimulator(workspace, PARAMS)
-    rates = np.stack([simulator.run(ROW, seed=seed).contact_rate for seed in range(400)])
-    z = workspace.along(ROW)
-    mean, variance = PARAMS.x0_mean, PARAMS.x0_sd**2
-    for k in range(3):
-        mean = 0.6 * mean + z[k] @ np.array([0.3, 0.2]) + 0.05
-        variance = 0.36 * variance + 0.05**2
-        sd = np.sqrt(variance + 0.05**2)
-        if k:  # the first rates are clipped
-            np.testing.assert_allclose(rates[:, k].mean(0), mean, atol=5.0 * sd / 20.0)
-            np.testing.assert_allclose(rates[:, k].std(0), sd, rtol=0.2)
+@pytest.mark.parametrize("family", ["gaussian", "censored"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_rates_have_the_moments_of_the_joint_normal(workspace, monkeypatch, kind, family):
+    """Of unit vectors instead of normal numbers, for which no rate is clipped."""
+    params = draws_of(kind, shape=(2, 4)).draw(0)
+    simulator = ModelSimulator(workspace, params, PooledTrust(family=family))
+    n_noises = 3 * (1 + 3 * 3)  # of the start, then of trust, shared and own, in three bounds
+    runs = []
+    for index in (None, *range(n_noises)):
+        with monkeypatch.context() as patch:
+            patch.setattr(np.random, "default_rng", lambda seed, i=index: Unit(i))
+            runs.append(simulator.run(ROW, seed=0).contact_rate)
+
+    assert 0.0 < np.min(runs) < np.max(runs) < 1.0
+    mean, cov = moments_of(runs)
+    dense = mission_of_params(params, workspace.along(ROW), ROW)
+    np.testing.assert_allclose(mean, dense.mean, rtol=1e-9)
+    np.testing.assert_allclose(cov, dense.rate_cov, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize("kind", ["pooled", "robots, deviation, places", "coupled"])
+def test_counts_have_the_moments_of_the_beta_binomial(workspace, kind):
+    """Of each rate, over its normal trust on the logit scale, within 5 standard errors."""
+    n, n_ticks = 150, 20
+    params = draws_of(kind, shape=(2, 4)).draw(0)
+    model = PooledTrust(family="beta_binomial")
+    simulator = ModelSimulator(workspace, params, model, n_ticks=n_ticks)
+    rates = np.stack([simulator.run(ROW, seed=seed).contact_rate for seed in range(n)])
+
+    dense = mission_of_params(params, workspace.along(ROW), ROW)
+    e, weight = np.polynomial.hermite_e.hermegauss(40)
+    trust = dense.mean[:, None] + np.sqrt(np.diag(dense.trust_cov))[:, None] * e
+    share = expit(trust)
+    sd = np.sqrt(np.diag(dense.rate_cov - dense.trust_cov))[:, None]
+    phi = sd**-2.0
+    law = stats.betabinom(n_ticks, phi * share, phi * (1.0 - share))
+    first, second = ((law.stats("m") / n_ticks), law.var() / n_ticks**2)
+    weight = weight / weight.sum()
+    mean = first @ weight
+    var = (second + first**2) @ weight - mean**2
+    flat = rates.reshape(n, -1)
+    assert (np.abs(flat.mean(0) - mean) < 5.0 * np.sqrt(var / n)).all()
+    np.testing.assert_allclose(flat.var(0), var, rtol=5.0 * np.sqrt(2.0 / n))
 
 
 def test_missions_end_as_often_as_the_probabilities_say(workspace):
