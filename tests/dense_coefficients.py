@@ -6,6 +6,8 @@ from the definitions of the models. Nothing of the package is imported; of a mod
 and the numbers of its priors are read. The cost grows with the cube of the number of rates.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from dense_statespace import (
     Form,
@@ -17,6 +19,7 @@ from dense_statespace import (
     stacked,
     trust_covariance,
 )
+from scipy.linalg import block_diag
 
 NUGGET = 1e-8
 """Variance added to the correlation of places, as the definition of `PlaceEffect` has it."""
@@ -120,130 +123,202 @@ def form_at(model, theta, n_robots):
 
 def inputs_of(model, observations, bounds=None):
     """Drift and offset (column, mission, bound, robot) of each coefficient."""
-    kind = type(model).__name__
+    lasts = model.memory != "deviation"
+    columns = []
+    for part in (model, *model.effects):
+        of_part = INPUTS[type(part).__name__](observations, bounds)
+        columns += [one if isinstance(one, tuple) else (one, lasts) for one in of_part]
+
+    shape = observations.contact_rate.shape
+    values = np.stack([values * np.ones(shape) for values, _ in columns])
+    carried = np.array([carried for _, carried in columns])[:, None, None, None]
+    return np.where(carried, values, 0.0), np.where(carried, 0.0, values)
+
+
+def features_of(observations):
+    """Awareness (mission, bound, robot, feature + 1), of which the last is 1 for the intercept."""
     z = observations.awareness
-    n_missions, n_bounds, n_robots, n_features = z.shape
-    every = np.concatenate([z, np.ones((*z.shape[:3], 1))], axis=3)  # the intercept is last
-    columns, carried = [], []
+    return np.concatenate([z, np.ones((*z.shape[:3], 1))], axis=3)
 
-    def add(values, lasts=None):
-        columns.append(values * np.ones(z.shape[:3]))
-        carried.append(model.memory != "deviation" if lasts is None else lasts)
 
-    def of_robot(i):
-        return np.arange(n_robots) == i
+def of_each(n):
+    """Masks (n,) of each of n robots."""
+    return np.eye(n, dtype=bool)
 
-    if kind == "CoupledTrust":
-        for i in range(n_robots):
-            for j in range(n_robots):
-                for m in range(n_features):
-                    add(z[:, :, j, m, None] * of_robot(i))
-            add(of_robot(i))
-    elif kind == "HierarchicalTrust":
-        for m in range(n_features + 1):
-            for i in range(n_robots):
-                add(every[..., m] * of_robot(i))
-    elif kind == "HumanTrust":
-        outcomes = {
-            prefix: [m for m, name in enumerate(observations.features) if name.startswith(prefix)]
-            for prefix in ("success", "failure")
-        }
-        for m in range(n_features):
-            add(z[..., m], m in sum(outcomes.values(), []))
-        add(1.0, False)
-        for j in range(n_missions):  # a person is a mission
-            person = (np.arange(n_missions) == j)[:, None, None]
-            first = (np.arange(n_bounds) == 0)[:, None]
-            add(person * first, True)  # start
-            add(person, False)  # level
-            for named in outcomes.values():
-                add(person * z[..., named[0]] if named else 0.0 * person, True)  # gain
-    else:
-        for m in range(n_features + 1):
-            add(every[..., m])
 
-    for effect in model.effects:
-        if type(effect).__name__ == "PlaceEffect":
-            for cell in cells_of(bounds):
-                add((bounds[..., 1:] == cell).all(-1)[..., None])
-            for bound in bounds_of(bounds):
-                add((bounds == bound).all(-1)[..., None])
-        else:
-            sight = line_of_sight(observations)
-            for i in range(n_robots):
-                for j in range(n_missions):
-                    mission = (np.arange(n_missions) == j)[:, None, None]
-                    add(sight * mission * of_robot(i))
+def of_missions(n):
+    """Masks (mission, 1, 1) of each of n missions."""
+    return np.eye(n, dtype=bool)[:, :, None, None]
 
-    columns = np.stack(columns).astype(float)
-    lasts = np.array(carried)[:, None, None, None]
-    return np.where(lasts, columns, 0.0), np.where(lasts, 0.0, columns)
+
+def pooled_inputs(observations, bounds):
+    """A weight of each feature and an intercept, common to all robots."""
+    return list(np.moveaxis(features_of(observations), 3, 0))
+
+
+def hierarchical_inputs(observations, bounds):
+    """Weights and intercepts of each robot; the robot varies fastest."""
+    every = np.moveaxis(features_of(observations), 3, 0)
+    return [values * robot for values in every for robot in of_each(every.shape[-1])]
+
+
+def coupled_inputs(observations, bounds):
+    """For each robot the weights of the features of all robots, and an intercept."""
+    z = observations.awareness
+    columns = []
+    for robot in of_each(z.shape[2]):
+        for j in range(z.shape[2]):
+            columns += [z[:, :, j, m, None] * robot for m in range(z.shape[3])]
+        columns.append(robot)
+    return columns
+
+
+def human_inputs(observations, bounds):
+    """Weights, of which those of outcomes last, and the parts of each person (a mission)."""
+    z, names = observations.awareness, observations.features
+    outcomes = [
+        [m for m, name in enumerate(names) if name.startswith(prefix)]
+        for prefix in ("success", "failure")
+    ]
+    columns = [(z[..., m], any(m in named for named in outcomes)) for m in range(z.shape[3])]
+    columns.append((1.0, False))
+
+    first = (np.arange(z.shape[1]) == 0)[:, None]
+    for person in of_missions(len(z)):
+        columns += [(person * first, True), (person, False)]  # start and level
+        columns += [(person * z[..., named[0]], True) for named in outcomes]  # gains
+    return columns
+
+
+def place_inputs(observations, bounds):
+    """Effects of the cells entered and of the directed bounds."""
+    columns = [(bounds[..., 1:] == cell).all(-1)[..., None] for cell in cells_of(bounds)]
+    return columns + [(bounds == bound).all(-1)[..., None] for bound in bounds_of(bounds)]
+
+
+def robot_inputs(observations, bounds):
+    """Effects of each robot in each mission, per line of sight; the mission varies fastest."""
+    n_missions, _, n_robots = observations.contact_rate.shape
+    sight = line_of_sight(observations)
+    return [
+        sight * mission * robot
+        for robot in of_each(n_robots)
+        for mission in of_missions(n_missions)
+    ]
+
+
+INPUTS = {
+    "PooledTrust": pooled_inputs,
+    "HierarchicalTrust": hierarchical_inputs,
+    "CoupledTrust": coupled_inputs,
+    "HumanTrust": human_inputs,
+    "PlaceEffect": place_inputs,
+    "RobotEffect": robot_inputs,
+}
+"""Inputs of trust per unit of each coefficient, by the class that brings the coefficients.
+
+An input may be a pair with whether it is carried over to later bounds.
+"""
+
+
+class Gain(NamedTuple):
+    """What a coefficient of stationary trust adds to the drift."""
+
+    of_effects: np.ndarray  # (robot,)
+    of_weights: np.ndarray  # (robot,), 1 unless priors are on stationary trust
 
 
 def prior_of(model, observations, theta, bounds=None):
     """Mean (column,) and covariance (column, column) of the coefficients at one theta."""
-    kind, priors = type(model).__name__, model.priors
-    n_missions, _, n_robots, n_features = observations.awareness.shape
-    mean = np.append(np.broadcast_to(priors.beta.loc, n_features), priors.b.loc)
-    sd = np.append(np.broadcast_to(priors.beta.scale, n_features), priors.b.scale)
-
-    # Priors may be on what a coefficient adds to stationary trust.
-    gain = np.ones(n_robots)
+    n_robots = observations.contact_rate.shape[2]
+    one = np.ones(n_robots)
+    gain = one
     if model.memory != "deviation":
-        gain = (1.0 - (np.diag(theta["B0"]) if "B0" in theta else theta["beta0"])) * gain
-    scale = gain if priors.stationary else np.ones(n_robots)
+        gain = one - (np.diag(theta["B0"]) if "B0" in theta else theta["beta0"])
+    gain = Gain(gain, gain if model.priors.stationary else one)
 
-    means, covs = [], []
-    if kind == "CoupledTrust":
-        for i in range(n_robots):
-            for j in range(n_robots):
-                if i == j:
-                    means.append(scale[i] * mean[:-1])
-                    covs.append(np.diag(scale[i] * sd[:-1]) ** 2)
-                else:
-                    means.append(np.full(n_features, float(priors.coupling.loc)))
-                    covs.append(np.eye(n_features) * float(priors.coupling.scale) ** 2)
-            means.append(scale[i] * mean[-1:])
-            covs.append(np.array([[scale[i] * sd[-1]]]) ** 2)
-    elif kind == "HierarchicalTrust":
-        tau = np.append(theta["tau_beta"], theta["tau_b"])
-        for m in range(n_features + 1):
-            means.append(np.full(n_robots, scale[0] * mean[m]))
-            covs.append((scale[0] * sd[m]) ** 2 + tau[m] ** 2 * np.eye(n_robots))
-    else:
-        means.append(scale[0] * mean)
-        covs.append(np.diag(scale[0] * sd) ** 2)
-    if kind == "HumanTrust":
-        for _ in range(n_missions):
-            sds = [theta[name] for name in ("tau_start", "tau_level", "tau_gain", "tau_gain")]
-            means.append(np.zeros(4))
-            covs.append(np.diag(sds) ** 2)
+    groups = []
+    for part in (model, *model.effects):
+        groups += PRIORS[type(part).__name__](part, observations, theta, bounds, gain)
+    return np.concatenate([mean for mean, _ in groups]), block_diag(*(cov for _, cov in groups))
 
-    for effect in model.effects:
-        if type(effect).__name__ == "PlaceEffect":
-            cells = cells_of(bounds)
-            gap = np.linalg.norm(cells[:, None] - cells, axis=2) * np.sqrt(3.0)
-            h = gap / theta["length_scale"]
-            matern = (1.0 + h) * np.exp(-h) + NUGGET * np.eye(len(cells))
-            covs.append(theta["tau_s"] ** 2 * matern)
-            covs.append(theta["tau_e"] ** 2 * np.eye(len(bounds_of(bounds))))
-        else:
-            mission = np.arange(n_missions)
-            lasting = effect.rho ** np.abs(mission[:, None] - mission)
-            of_one = theta["tau_slow"] ** 2 * lasting + theta["tau_mission"] ** 2 * np.eye(
-                n_missions
-            )
-            covs += [gain[i] ** 2 * of_one for i in range(n_robots)]
 
-    n_columns = sum(len(cov) for cov in covs)
-    means = np.concatenate(means)
-    every = np.zeros((n_columns, n_columns))
-    first = 0
-    for cov in covs:
-        last = first + len(cov)
-        every[first:last, first:last] = cov
-        first = last
-    return np.append(means, np.zeros(n_columns - len(means))), every
+def weight_prior(model, n_features):
+    """Prior means and standard deviations (feature + 1,) of the weights and the intercept."""
+    beta, b = model.priors.beta, model.priors.b
+    mean = np.append(np.broadcast_to(beta.loc, n_features), b.loc)
+    return mean, np.append(np.broadcast_to(beta.scale, n_features), b.scale)
+
+
+def pooled_prior(model, observations, theta, bounds, gain):
+    """Independent normal priors."""
+    mean, sd = weight_prior(model, observations.awareness.shape[3])
+    return [(gain.of_weights[0] * mean, np.diag(gain.of_weights[0] * sd) ** 2)]
+
+
+def hierarchical_prior(model, observations, theta, bounds, gain):
+    """Coefficients of robots, with a normal common mean integrated out."""
+    n_robots, n_features = observations.awareness.shape[2:]
+    mean, sd = weight_prior(model, n_features)
+    tau = np.append(theta["tau_beta"], theta["tau_b"])
+    scale = gain.of_weights
+    return [
+        (scale * mean[m], (scale[0] * sd[m]) ** 2 + tau[m] ** 2 * np.eye(n_robots))
+        for m in range(n_features + 1)
+    ]
+
+
+def coupled_prior(model, observations, theta, bounds, gain):
+    """Own weights as of the pooled model, and weights of other robots' features."""
+    n_robots, n_features = observations.awareness.shape[2:]
+    mean, sd = weight_prior(model, n_features)
+    coupling = model.priors.coupling
+    means = np.full((n_robots, n_robots, n_features), float(coupling.loc))
+    sds = np.full((n_robots, n_robots, n_features), float(coupling.scale))
+    groups = []
+    for i, scale in enumerate(gain.of_weights):
+        means[i, i], sds[i, i] = scale * mean[:-1], scale * sd[:-1]
+        of_robot = np.append(means[i], scale * mean[-1]), np.append(sds[i], scale * sd[-1])
+        groups.append((of_robot[0], np.diag(of_robot[1]) ** 2))
+    return groups
+
+
+def human_prior(model, observations, theta, bounds, gain):
+    """Weights as of the pooled model, and parts of persons with mean 0."""
+    sds = [theta[name] for name in ("tau_start", "tau_level", "tau_gain", "tau_gain")]
+    persons = [(np.zeros(4), np.diag(sds) ** 2)] * len(observations.contact_rate)
+    return pooled_prior(model, observations, theta, bounds, gain) + persons
+
+
+def place_prior(effect, observations, theta, bounds, gain):
+    """A Matern 3/2 process over cells, and independent effects of bounds."""
+    cells, n_bounds = cells_of(bounds), len(bounds_of(bounds))
+    distance = np.linalg.norm(cells[:, None] - cells, axis=2)
+    h = np.sqrt(3.0) * distance / theta["length_scale"]
+    matern = (1.0 + h) * np.exp(-h) + NUGGET * np.eye(len(cells))
+    return [
+        (np.zeros(len(cells)), theta["tau_s"] ** 2 * matern),
+        (np.zeros(n_bounds), theta["tau_e"] ** 2 * np.eye(n_bounds)),
+    ]
+
+
+def robot_prior(effect, observations, theta, bounds, gain):
+    """A lasting part and a part of one mission, independent between robots."""
+    mission = np.arange(len(observations.contact_rate))
+    lasting = effect.rho ** np.abs(mission[:, None] - mission)
+    cov = theta["tau_slow"] ** 2 * lasting + theta["tau_mission"] ** 2 * np.eye(len(mission))
+    return [(np.zeros(len(mission)), of_robot**2 * cov) for of_robot in gain.of_effects]
+
+
+PRIORS = {
+    "PooledTrust": pooled_prior,
+    "HierarchicalTrust": hierarchical_prior,
+    "CoupledTrust": coupled_prior,
+    "HumanTrust": human_prior,
+    "PlaceEffect": place_prior,
+    "RobotEffect": robot_prior,
+}
+"""Means and covariances of groups of coefficients, in the order of `INPUTS`."""
 
 
 def cells_of(bounds):

@@ -58,7 +58,7 @@ def with_one_limit(mean, cov, y):
 
 
 def trust_with_one_limit(mean, trust_cov, rate_cov, y):
-    """Mean and standard deviation (rate,) of trust given rates as in `with_one_limit`."""
+    """Mean and covariance of trust given rates as in `with_one_limit`."""
     [at] = np.flatnonzero((y <= 0.0) | (y >= 1.0))
     others = np.where(np.arange(len(y)) == at, np.nan, y)
 
@@ -74,8 +74,8 @@ def trust_with_one_limit(mean, trust_cov, rate_cov, y):
     if y[at] >= 1.0:
         truncated = stats.truncnorm((y[at] - m[-1]) / sd, np.inf)
     gain = cov[:-1, -1] / sd
-    left = np.diag(cov)[:-1] - gain**2 * (1.0 - truncated.var())
-    return m[:-1] + gain * truncated.mean(), np.sqrt(left)
+    left = cov[:-1, :-1] - np.outer(gain, gain) * (1.0 - truncated.var())
+    return m[:-1] + gain * truncated.mean(), left
 
 
 def expected_rate(family, trust, sd):

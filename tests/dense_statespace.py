@@ -140,53 +140,77 @@ def mission_of(form, drift, offset):
 
 
 def mission_of_params(params, awareness, path=None, *, x0=None):
-    """Joint normal of a mission under one draw of parameters; see `equations_of_params`."""
+    """Joint normal of a mission under draws of parameters; see `equations_of_params`."""
     return mission_of(*equations_of_params(params, awareness, path, x0=x0))
 
 
 def trust_of_params(params, awareness, path=None, *, x0=None):
-    """Expected trust (bound, robot) under one draw of parameters; see `equations_of_params`."""
+    """Expected trust (..., bound, robot) under draws of parameters; see `equations_of_params`."""
     return expected_trust(*equations_of_params(params, awareness, path, x0=x0))
 
 
 def equations_of_params(params, awareness, path=None, *, x0=None):
-    """Form, drift and offset (bound, robot) of a mission under one draw of parameters.
+    """Form, drift and offset (..., bound, robot) of a mission under draws of parameters.
 
     Args:
-        params: One draw of `TrustParams`, `RobotParams` or `CoupledParams`, whose fields are read.
+        params: `TrustParams`, `RobotParams` or `CoupledParams`, whose fields (..., ...) are read.
         awareness: Awareness (bound, robot, feature).
         path: Cells from the start on; needed with effects of places.
         x0: Trust before the first bound, if it is known.
     """
-    n_bounds, n_robots, n_features = awareness.shape
-    u = np.zeros((n_bounds, n_robots))
-    for k in range(n_bounds):
-        for i in range(n_robots):
-            u[k, i] = params.b[i] if np.ndim(params.b) else params.b
-            for m in range(n_features):
-                if hasattr(params, "B0"):
-                    for j in range(n_robots):
-                        u[k, i] += params.B[m, i, j] * awareness[k, j, m]
-                else:
-                    beta = params.beta[i] if np.ndim(params.beta) == 2 else params.beta
-                    u[k, i] += beta[m] * awareness[k, i, m]
+    n_robots = awareness.shape[1]
+    u = np.stack(
+        [np.stack([weighted(params, z, i) for i in range(n_robots)], axis=-1) for z in awareness],
+        axis=-2,
+    )
+    if path is not None:
+        u = u + of_places(params, path)
 
-    if params.place is not None or params.place_bound is not None:
-        for k, (before, cell) in enumerate(pairwise(path)):
-            move = STEPS.index((cell[0] - before[0], cell[1] - before[1]))
-            if params.place is not None:
-                u[k] += params.place[:, cell[0], cell[1]]
-            if params.place_bound is not None:
-                u[k] += params.place_bound[:, move, cell[0], cell[1]]
-
-    x0 = (params.x0_mean, params.x0_sd) if x0 is None else (x0, 0.0)
+    own = np.eye(n_robots)
+    x0_mean, x0_sd = (params.x0_mean, params.x0_sd) if x0 is None else (x0, 0.0)
+    m0 = np.asarray(x0_mean)[..., None] * np.ones(n_robots)
+    P0 = np.asarray(x0_sd)[..., None, None] ** 2 * own
     if hasattr(params, "B0"):
-        form = form_of(params.B0, params.Delta_w, params.Delta_v, *x0, n_robots=n_robots)
+        form = Form(params.B0, params.Delta_w, m0, P0, params.Delta_v)
         return form, u, np.zeros_like(u)
 
-    deviation = params.memory == "deviation"
-    form = form_of(
-        params.beta0, params.delta_w, params.delta_v, *x0, n_robots=n_robots,
-        delta_s=0.0 if params.delta_s is None else params.delta_s, deviation=deviation,
-    )  # fmt: skip
-    return (form, np.zeros_like(u), u) if deviation else (form, u, np.zeros_like(u))
+    def diagonal(values):
+        if type(params).__name__ == "TrustParams":  # of all robots
+            values = np.asarray(values)[..., None]
+        return values[..., None] * own
+
+    noise = diagonal(params.delta_v) ** 2
+    if params.delta_s is not None:
+        noise = noise + np.asarray(params.delta_s)[..., None, None] ** 2
+    form = Form(diagonal(params.beta0), diagonal(params.delta_w) ** 2, m0, P0, noise)
+    if params.memory == "deviation":
+        return form._replace(m0=0.0 * m0), np.zeros_like(u), u
+    return form, u, np.zeros_like(u)
+
+
+def weighted(params, z, i):
+    """Intercept and weighted awareness (...,) of robot i in a bound, for awareness z."""
+    total = params.b if type(params).__name__ == "TrustParams" else params.b[..., i]
+    for m in range(z.shape[1]):
+        if hasattr(params, "B0"):
+            for j in range(len(z)):
+                total = total + params.B[..., m, i, j] * z[j, m]
+        elif type(params).__name__ == "TrustParams":
+            total = total + params.beta[..., m] * z[i, m]
+        else:
+            total = total + params.beta[..., i, m] * z[i, m]
+    return total
+
+
+def of_places(params, path):
+    """Effects (..., bound, robot or 1) of the cells that a path enters, and of its bounds."""
+    effects = []
+    for before, (row, col) in pairwise(path):
+        move = STEPS.index((row - before[0], col - before[1]))
+        effect = np.zeros(1)
+        if params.place is not None:
+            effect = effect + params.place[..., row, col]
+        if params.place_bound is not None:
+            effect = effect + params.place_bound[..., move, row, col]
+        effects.append(effect)
+    return np.stack(effects, axis=-2)

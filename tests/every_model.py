@@ -70,12 +70,12 @@ def draws_of(kind, *, n_draws=3, n_robots=3, shape=GRID, seed=0):
         places["place_bound"] = 0.03 * rng.normal(size=(n_draws, n, 8, *shape))
 
     if model == "coupled":
-        B0 = rng.uniform(0.0, 0.15, (n_draws, n_robots, n_robots))
-        B0 += 0.4 * np.eye(n_robots)
+        B0 = rng.uniform(0.0, 0.1, (n_draws, n_robots, n_robots))
+        B0 += 0.3 * np.eye(n_robots)
         B = 0.05 * rng.normal(size=(n_draws, 2, n_robots, n_robots))
         root_w, root_v = 0.06 * rng.normal(size=(2, n_draws, n_robots, n_robots))
         own = 0.005 * np.eye(n_robots)
-        b = rng.uniform(0.1, 0.2, (n_draws, n_robots))
+        b = rng.uniform(0.2, 0.3, (n_draws, n_robots))
         noises = root_w @ root_w.mT + own, root_v @ root_v.mT + own
         return CoupledParams(B0, B, b, *noises, *x0, **places)
 

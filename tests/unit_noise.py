@@ -1,7 +1,7 @@
 """Exact moments of what is drawn, for functions that are linear in standard normal numbers.
 
-A function that adds R e to a mean, with standard normal numbers e, gives the mean for e = 0, and the
-mean plus a column of R for each unit vector e. Its draws then have the covariance R R'.
+A function that adds R e to a mean, with standard normal numbers e, gives the mean for e = 0, and
+the mean plus a column of R for each unit vector e. Its draws then have the covariance R R'.
 """
 
 import numpy as np

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from baselines import line_of_sight, oracle, paths, residual_process, running_mean
+from enumeration import paths_of
 
 import trustbo as tb
 from trustbo.data import Bound, Mission
@@ -34,25 +35,6 @@ def planner(workspace):
     return Planner(workspace, START, GOAL, max_bounds="shortest+2")
 
 
-def every_path(planner):
-    """All walks without U-turns from start to goal, by depth first."""
-    steps, walks = MOVES, []
-    free = planner.workspace.passable_bounds.values
-
-    def extend(walk):
-        if walk[-1] == planner.goal:
-            walks.append(tuple(walk))
-        elif len(walk) <= planner.problem.paths.longest:
-            for step in steps:
-                cell = (walk[-1][0] + step[0], walk[-1][1] + step[1])
-                inside = all(0 <= i < n for i, n in zip(cell, free.shape[1:], strict=True))
-                if inside and cell not in walk[-2:-1] and free[(MOVES.index(step), *cell)]:
-                    extend([*walk, cell])
-
-    extend([planner.start])
-    return walks
-
-
 def mission_of(planner, path, rates, n_driven=None):
     """Mission with these rates of its bounds, the same of all robots."""
     n_robots, n_features = 3, len(planner.workspace.features)
@@ -75,7 +57,7 @@ def rates_along(table, path):
 @pytest.mark.parametrize("objective", ["lost_contact", "mean"])
 def test_best_paths_are_admissible_and_the_best_under_their_rates(planner, objective):
     planner = Planner(planner.workspace, START, GOAL, objective, max_bounds="shortest+2")
-    walks, rng = every_path(planner), np.random.default_rng(0)
+    walks, rng = paths_of(planner), np.random.default_rng(0)
     sight = paths.line_of_sight(planner)
     tables = np.clip(sight + rng.normal(0.0, 0.2, (40, *sight.shape)), 0.0, 1.0)
     chosen = paths.best_paths(planner, tables)
@@ -156,7 +138,7 @@ def test_a_baseline_is_that_of_line_of_sight_at_first_and_leaves_a_path_that_is_
     policy = make()
     campaign = SimpleNamespace(planner=planner)
     first = policy.recommend(campaign)
-    walks = every_path(planner)
+    walks = paths_of(planner)
     best = max(paths.predicted(planner, walk) for walk in walks)
     assert paths.predicted(planner, first) == pytest.approx(best)
     sight = paths.line_of_sight(planner)

@@ -40,10 +40,11 @@ def mission_seen(n_robots=3, seed=1):
     return z, y
 
 
-def averaged(weight, means, sds):
-    """Mean and standard deviation over weighted draws."""
+def averaged(weight, means, covs):
+    """Mean and standard deviation of trust over weighted draws."""
     mean = weight @ means
-    return mean, np.sqrt(weight @ (np.square(sds) + (means - mean) ** 2))
+    var = np.diagonal(covs, axis1=-2, axis2=-1)
+    return mean, np.sqrt(weight @ (var + (means - mean) ** 2))
 
 
 def weights_of(log_density):
@@ -55,20 +56,17 @@ def weights_of(log_density):
 def test_after_each_bound_trust_is_its_exact_posterior(kind):
     params = draws_of(kind)
     z, y = mission_seen()
-    dense = [mission_of_params(params.draw(i), z, PATH) for i in range(3)]
+    dense = mission_of_params(params, z, PATH)
     live = TrustFilter(params, n_robots=3)
     for k in range(len(z)):
         state = live.update(z[k], y[k], PATH[k : k + 2])
         until = np.where(np.arange(len(z))[:, None] <= k, y, np.nan)
-        weight = weights_of([one.log_density(until) for one in dense])
-        given = [one.trust_given(until) for one in dense]
+        weight = weights_of(dense.log_density(until))
+        mean, sd = averaged(weight, *dense.trust_given(until))
         now = slice(3 * k, 3 * k + 3)
-        means = np.array([mean[now] for mean, _ in given])
-        sds = np.array([np.sqrt(np.diag(cov)[now]) for _, cov in given])
-        mean, sd = averaged(weight, means, sds)
         np.testing.assert_allclose(live.weights, weight, rtol=1e-9)
-        np.testing.assert_allclose(state.mean, mean, rtol=1e-9)
-        np.testing.assert_allclose(state.sd, sd, rtol=1e-9)
+        np.testing.assert_allclose(state.mean, mean[now], rtol=1e-9)
+        np.testing.assert_allclose(state.sd, sd[now], rtol=1e-9)
     assert live.n_bounds == len(z)
 
 
@@ -82,12 +80,8 @@ def test_trust_ahead_is_that_of_the_joint_normal(kind):
         live.update(z[k], y[k], PATH[k : k + 2])
     ahead = live.predict(z[2:], PATH[2:])
 
-    dense = [mission_of_params(params.draw(i), z, PATH) for i in range(3)]
-    weight = weights_of([one.log_density(y) for one in dense])
-    given = [one.trust_given(y) for one in dense]
-    means = np.array([mean for mean, _ in given])
-    sds = np.array([np.sqrt(np.diag(cov)) for _, cov in given])
-    mean, sd = averaged(weight, means, sds)
+    dense = mission_of_params(params, z, PATH)
+    mean, sd = averaged(weights_of(dense.log_density(y)), *dense.trust_given(y))
     np.testing.assert_allclose(ahead.mean.ravel(), mean[6:], rtol=1e-9)
     np.testing.assert_allclose(ahead.sd.ravel(), sd[6:], rtol=1e-9)
 
@@ -103,14 +97,14 @@ def test_a_censored_rate_after_others_inside_is_followed_exactly(kind, limit):
     for k in range(len(z)):
         state = live.update(z[k], y[k], PATH[k : k + 2])
 
+    each = list(zip(*mission_of_params(params, z, PATH), strict=True))
     flat = y.ravel()
-    dense = [mission_of_params(params.draw(i), z, PATH) for i in range(3)]
-    weight = weights_of([with_one_limit(one.mean, one.rate_cov, flat) for one in dense])
-    given = [trust_with_one_limit(*one, flat) for one in dense]
-    mean, sd = averaged(weight, *(np.array([one[i][-3:] for one in given]) for i in (0, 1)))
+    weight = weights_of([with_one_limit(mean, rate_cov, flat) for mean, _, rate_cov in each])
+    given = [trust_with_one_limit(*moments, flat) for moments in each]
+    mean, sd = averaged(weight, *(np.stack(moments) for moments in zip(*given, strict=True)))
     np.testing.assert_allclose(live.weights, weight, rtol=1e-9)
-    np.testing.assert_allclose(state.mean, mean, rtol=1e-9)
-    np.testing.assert_allclose(state.sd, sd, rtol=1e-9)
+    np.testing.assert_allclose(state.mean, mean[-3:], rtol=1e-9)
+    np.testing.assert_allclose(state.sd, sd[-3:], rtol=1e-9)
 
 
 def test_predicting_is_updating_with_nothing_measured():

@@ -102,7 +102,8 @@ def test_likelihoods_are_those_of_a_chain_of_deviations(deviations):
     d = posterior["robots"]["robot_effect"].values[0, 7]
     params = tb.inference.params_of(posterior)
     assert params.memory == "deviation"
-    of_draw = params.draw(7)._replace(beta=draws["beta"].values, b=float(draws["b"]))
+    weights = {"beta": np.tile(draws["beta"].values, (3, 1)), "b": np.full(3, float(draws["b"]))}
+    of_draw = params.draw(7)._replace(**weights)
     for j, mission in enumerate(deviations):
         form, drift, offset = equations_of_params(of_draw, mission.awareness, mission.path)
         offset = offset + d[j] * mission.awareness[..., 0]
@@ -117,10 +118,7 @@ def test_scores_are_of_deviations_that_last(deviations):
     posterior = tb.fit(deviations, model, draws=25, chains=1, progress=False)
     params = tb.inference.params_of(posterior)
     table = tb.inference.score(posterior, deviations)
-    densities = []
-    for i in range(25):
-        dense = mission_of_params(params.draw(i), deviations[2].awareness)
-        sd = np.sqrt(np.diag(dense.rate_cov))
-        densities.append(stats.norm.pdf(deviations[2].contact_rate.ravel(), dense.mean, sd))
-    expected = np.log(np.mean(densities, axis=0))
-    np.testing.assert_allclose(np.ravel(table["log_score"][2]), expected, rtol=1e-9)
+    dense = mission_of_params(params, deviations[2].awareness)
+    sd = np.sqrt(np.diagonal(dense.rate_cov, axis1=1, axis2=2))
+    density = stats.norm.pdf(deviations[2].contact_rate.ravel(), dense.mean, sd).mean(0)
+    np.testing.assert_allclose(np.ravel(table["log_score"][2]), np.log(density), rtol=1e-9)

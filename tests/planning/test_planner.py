@@ -4,6 +4,9 @@ import networkx as nx
 import numpy as np
 import pytest
 import xarray as xr
+from dense_statespace import mission_of_params, trust_of_params
+from enumeration import paths_of, value_of
+from every_model import KINDS, draws_of
 from scipy.special import expit
 
 from trustbo.errors import TrustboError
@@ -11,7 +14,7 @@ from trustbo.inference import fit, params_of, sample_prior
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.models import PooledTrust, TrustParams
 from trustbo.models.params import CoupledParams, RobotParams
-from trustbo.planning import Planner, expected_trust, reference
+from trustbo.planning import OBJECTIVES, Planner, expected_trust, reference
 from trustbo.planning.paths import STEPS
 from trustbo.simulation import ModelSimulator
 from trustbo.workspace import Workspace
@@ -35,20 +38,50 @@ def draws():
 
 
 def trust_along(workspace, params, path):
-    """Trust of the team along a path, rolled."""
-    return expected_trust(params, workspace.along(path)).mean(-1)
+    """Trust of the team (..., bound) along a path, by the dense reference."""
+    return trust_of_params(params, workspace.along(path), path).mean(-1)
 
 
-def test_expected_trust_follows_equation_3():
-    z = np.random.default_rng(1).uniform(size=(4, 2, 2))
-    trust, x = expected_trust(PARAMS, z, x0=0.3), np.full(2, 0.3)
-    for k in range(4):
-        x = 0.6 * x + z[k] @ [0.3, 0.2] + 0.05
-        np.testing.assert_allclose(trust[k], x)
-    many = TrustParams(*(np.stack([v, v]) for v in PARAMS[:5]), 0.3, 0.5)
-    np.testing.assert_allclose(expected_trust(many, z)[1], trust)
+@pytest.mark.parametrize("x0", [None, 0.3])
+@pytest.mark.parametrize("kind", KINDS)
+def test_expected_trust_is_the_mean_of_the_joint_normal(kind, x0):
+    path = [(0, 0), (1, 1), (1, 2), (2, 1), (2, 2)]
+    z = np.random.default_rng(1).uniform(size=(4, 3, 2))
+    draws = draws_of(kind)
+    trust = expected_trust(draws, z, x0, path=path)
+    expected = trust_of_params(draws, z, path, x0=x0)
+    np.testing.assert_allclose(trust, expected, rtol=1e-10)
+    np.testing.assert_allclose(expected_trust(draws.draw(1), z, x0, path=path), expected[1])
+
+
+def test_expected_trust_of_other_features_is_refused():
     with pytest.raises(TrustboError):
         expected_trust(PARAMS, np.zeros((4, 2, 3)))
+
+
+@pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_plans_of_every_model_are_the_best_of_all_paths(kind, family):
+    """Trust is that of the dense reference, and values are by their definition."""
+    z = np.random.default_rng(2).uniform(size=(3, 8, 3, 3, 2))
+    workspace = Workspace.from_awareness(z)
+    params = draws_of(kind, shape=(3, 3)).draw(0)
+    one = mission_of_params(params, np.zeros((1, 3, 2)), [(0, 0), (0, 1)])
+    noise_sd = np.sqrt(np.diag(one.rate_cov - one.trust_cov)).mean()
+    for objective in OBJECTIVES:
+        planner = Planner(
+            workspace, (2, 0), (0, 2), objective, family=family, max_bounds="shortest+2"
+        )
+        plan = planner.plan(params)
+        values = {
+            path: value_of(params, workspace, path, objective, family, noise_sd)
+            for path in paths_of(planner)
+        }
+        assert len(values) > 10
+        assert plan.value == pytest.approx(max(values.values()), rel=1e-9)
+        assert values[plan.path] == pytest.approx(plan.value, rel=1e-9)
+        trust = trust_of_params(params, workspace.along(plan.path), plan.path)
+        np.testing.assert_allclose(plan.trust, trust, rtol=1e-9)
 
 
 def test_a_plan_has_the_trust_and_the_value_of_its_path(workspace, draws):
@@ -212,7 +245,7 @@ def test_failures_cost_at_most_what_the_graph_says(workspace):
 def test_regret_and_shares_of_cells_are_what_enumeration_says(workspace, draws):
     planner = Planner(workspace, *ENDS, "terminal")
     drawn = planner.plan_draws(draws)
-    paths = list(reference.every_path(planner.problem.paths))
+    paths = paths_of(planner)
     last = np.stack([trust_along(workspace, draws, path)[:, -1] for path in paths], axis=1)
     values = 1.0 / (1.0 + np.exp(-last))
     np.testing.assert_allclose(drawn.values, values.max(1), rtol=1e-12)

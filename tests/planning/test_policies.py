@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from enumeration import paths_of
 
 from trustbo.errors import TrustboError
 from trustbo.inference import sample_prior
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
-from trustbo.planning import POLICIES, Planner, policies, reference
+from trustbo.planning import POLICIES, Planner, policies
 from trustbo.planning.policies import resolve_policy
 from trustbo.workspace import Workspace
 
@@ -29,7 +30,7 @@ def rng(seed=0):
 
 def values_of_all(planner, draws):
     """Every admissible path, and its value under every draw, shape (draw, path)."""
-    paths = list(reference.every_path(planner.problem.paths))
+    paths = paths_of(planner)
     return paths, planner.plan_draws(draws).values_of(paths)
 
 

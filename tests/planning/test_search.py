@@ -6,6 +6,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from enumeration import paths_of
 from fuzz_plans import draw_problem, faults
 from peers.every_path import TooManyError, best_walk
 
@@ -111,7 +112,8 @@ def test_networkx_finds_plans_of_functions(workspace, options, by_robot):
 
 @pytest.mark.parametrize("max_bounds", ["shortest", "shortest+2", 5])
 def test_the_unrolled_graph_has_every_admissible_path(workspace, max_bounds):
-    paths = Planner(workspace, *ENDS, max_bounds=max_bounds).problem.paths
+    planner = Planner(workspace, *ENDS, max_bounds=max_bounds)
+    paths = planner.problem.paths
     graph = paths.graph.to_networkx(np.zeros(len(paths.graph.head)))
     assert nx.is_directed_acyclic_graph(graph)
     found = set()
@@ -120,7 +122,7 @@ def test_the_unrolled_graph_has_every_admissible_path(workspace, max_bounds):
         for nodes in nx.all_simple_paths(graph, start, "goal"):
             cells = np.array([node[1] for node in nodes[:-1]])
             found.add((*paths.cells(cells), paths.goal))
-    assert found == set(reference.every_path(paths))
+    assert found == set(paths_of(planner))
     assert max_bounds == "shortest" or len(found) > 3
 
 
@@ -131,7 +133,7 @@ def test_a_new_objective_is_a_row(workspace, monkeypatch):
     bound_cost = np.random.default_rng(1).uniform(0.0, 0.2, (8, 4, 4))
     planner = Planner(workspace, *ENDS, "late", bound_cost=bound_cost)
     values = []
-    for path in reference.every_path(planner.problem.paths):
+    for path in paths_of(planner):
         plan = planner.evaluate(path, PARAMS)
         trust = plan.trust.mean(1)
         n = len(trust)
@@ -159,7 +161,7 @@ def test_an_infeasible_limit_is_an_error_with_the_safest_path(workspace):
     p = np.random.default_rng(2).uniform(0.05, 0.3, (8, 4, 4))
     planner = Planner(workspace, *ENDS, max_failure=0.1).with_risk(p)
     risk = planner.problem.risk
-    survival = {path: risk.survival(path) for path in reference.every_path(planner.problem.paths)}
+    survival = {path: risk.survival(path) for path in paths_of(planner)}
     with pytest.raises(InfeasibleError, match="max_failure") as error:
         planner.plan(PARAMS)
     assert error.value.path == max(survival, key=survival.get)

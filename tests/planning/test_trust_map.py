@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from dense_statespace import trust_of_params
+from enumeration import paths_of
 
 from trustbo.inference import sample_prior
 from trustbo.models import HierarchicalTrust, PooledTrust
-from trustbo.planning import Planner, expected_trust, reference
+from trustbo.planning import Planner
 from trustbo.workspace import Workspace
 
 ENDS = (3, 0), (0, 3)
@@ -29,11 +31,11 @@ def test_a_trust_map_is_the_best_of_all_paths_to_each_cell(workspace, model):
     for row, col in np.argwhere(workspace.passable.values).tolist():
         if (row, col) == planner.start:
             continue
-        last = []
-        for path in reference.every_path(planner.problem.paths.to((row, col), 2)):
-            z = workspace.along(path)
-            last.append(expected_trust(draws, z)[:, -1])
-        last = np.stack(last)  # (path, draw, robot)
+        nearest = int(planner.problem.paths.to((row, col), 0).longest)
+        paths = paths_of(planner, (row, col), longest=nearest + 2)
+        last = np.stack(  # (path, draw, robot)
+            [trust_of_params(draws, workspace.along(path))[:, -1] for path in paths]
+        )
         np.testing.assert_allclose(maps[:, row, col], last.mean(-1).max(0), rtol=1e-12)
         np.testing.assert_allclose(by_robot[:, :, row, col], last.max(0), rtol=1e-12)
     assert np.isnan(maps[:, 1, 1]).all()

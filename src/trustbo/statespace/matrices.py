@@ -8,6 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 
+_JITTER = 1e-12
+"""Added to covariances, which may be singular, before their factors are computed."""
+_JITTER_32 = 1e-6
+"""The same in single precision, the default of JAX."""
+
+
 def namespace(x: Any) -> ModuleType:
     """Return `jax.numpy` for a JAX array, otherwise NumPy, so that one formula works for both."""
     return jnp if isinstance(x, jax.Array) else np
@@ -45,4 +51,5 @@ def root(cov: Any) -> Any:
     if n == 1:
         return xp.sqrt(cov)
 
-    return xp.linalg.cholesky(cov + 1e-12 * np.eye(n))
+    jitter = _JITTER if cov.dtype == np.float64 else _JITTER_32
+    return xp.linalg.cholesky(cov + jitter * np.eye(n, dtype=cov.dtype))
