@@ -1,19 +1,17 @@
 """Workspaces, terrains and simulators made for tests."""
 
 import dataclasses
-import os
-import shutil
-from pathlib import Path
+from itertools import pairwise
 
 import numpy as np
 import xarray as xr
 from missions import TRUTH, draw_rates
 
-import trustbo as tb
 from trustbo.data import Mission
 from trustbo.terrain import synthetic_terrain
 from trustbo.terrain.read import read_terrain
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import MOVE_NAMES, MOVES
 
 CORNER = np.array([100.0, 500.0])  # of `terrain_of`: x of the left edge, y of the top, m
 
@@ -67,47 +65,19 @@ class ModelSimulator:
         return Mission.from_arrays(path, z, rates, duration=np.full(len(z), 30.0), status=status)
 
 
-def begin(workspace, folder, n):
-    """A campaign of n missions in a folder; its robots measure no awareness."""
-    return tb.iterate(
-        workspace, (3, 0), (0, 3), n_iterations=n, directory=folder, sampler="importance",
-        policy="thompson", simulator=ModelSimulator(workspace, blind=True),
-        progress=False,
-    )  # fmt: skip
-
-
-def resume_or_begin(workspace, folder, n):
-    """The same, going on with what is there."""
-    if not (Path(folder) / "campaign.json").exists():
-        return begin(workspace, folder, n)
-    simulator = ModelSimulator(workspace, blind=True)
-    return tb.resume(folder, simulator=simulator, n_iterations=n, progress=False)
-
-
-def moments_of(folder, copies, monkeypatch):
-    """Copy the folder just before each file of it appears or goes, as a kill then leaves it.
-
-    A file that is being written has half of its bytes under its temporary name. Returned is the
-    name of the file of each copy, with whether it appears.
-    """
-    names = [None]
-
-    def watched(change):
-        def changes(file, *target, **options):
-            if folder in Path(file).parents and Path(file).exists():
-                copies.append(copies[0].with_name(f"moment{len(copies)}"))
-                shutil.copytree(folder, copies[-1], ignore=shutil.ignore_patterns(".lock"))
-                if target:
-                    half = Path(file).stat().st_size // 2
-                    os.truncate(copies[-1] / Path(file).relative_to(folder), half)
-                names.append((Path(*target or [file]).name, bool(target)))
-            change(file, *target, **options)
-
-        return changes
-
-    monkeypatch.setattr(os, "replace", watched(os.replace))
-    monkeypatch.setattr(Path, "unlink", watched(Path.unlink))
-    return names
+def contact_along(truth, path):
+    """Expected contact (bound,) of a path in a `Truth`, read from its table of bounds."""
+    moves = [
+        MOVE_NAMES[MOVES.index((row - before[0], col - before[1]))]
+        for before, (row, col) in pairwise(path)
+    ]
+    table = truth.bounds["contact"]
+    return np.array(
+        [
+            float(table.sel(move=move, next_move=onward)[tuple(cell)])
+            for move, onward, cell in zip(moves, [*moves[1:], "end"], path[1:], strict=True)
+        ]
+    )
 
 
 class Steady:

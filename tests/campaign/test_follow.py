@@ -210,13 +210,13 @@ def test_what_cannot_be_is_refused_and_changes_nothing(act, named):
     follower = tb.Follower(begun(n_missions=0))
     follower.begin(0.0)
     follower.tick(5.0, [1, 0, np.nan])
-    counts, trust = follower._counts.copy(), follower.trust
+    trust = follower.trust
     with pytest.raises(tb.TrustboError, match=named):
         act(follower)
-    np.testing.assert_array_equal(follower._counts, counts)
     np.testing.assert_array_equal(follower.trust, trust)
     follower.end(5.0)
     np.testing.assert_array_equal(follower.bounds[0].n_ticks, [1, 1, np.nan])
+    np.testing.assert_array_equal(follower.bounds[0].contact_rate, [1.0, 0.0, np.nan])
     np.testing.assert_array_equal(follower.trust, trust)
 
 

@@ -12,7 +12,7 @@ from rasterio.warp import transform
 
 from trustbo.errors import TrustboError
 from trustbo.export import WRITERS, export_result, write_csv, write_geojson, write_geotiff
-from trustbo.export.gis import _cut
+from trustbo.export.gis import cut_at_180
 
 
 def test_bands_of_a_geotiff_are_the_maps_in_their_place(result, maps, tmp_path):
@@ -47,7 +47,7 @@ def test_places_in_geojson_are_those_of_the_plan(result, tmp_path):
 
 @pytest.mark.parametrize("west", [-180.5, 179.5])
 def test_a_line_across_180_degrees_is_cut_there(west):
-    cut = _cut(shapely.LineString([(west, -17.0), (west + 1.0, -16.0)]))
+    cut = cut_at_180(shapely.LineString([(west, -17.0), (west + 1.0, -16.0)]))
     parts = [np.array(part.coords) for part in cut.geoms]
     assert len(parts) == 2
     assert max(np.ptp(part[:, 0]) for part in parts) <= 0.5

@@ -67,8 +67,8 @@ def test_the_evidence_with_one_rate_at_a_limit_has_the_normal_tail_beyond_it(nam
 @pytest.fixture
 def chained(monkeypatch):
     """Eliminates robots' effects as chains, as with a hundred missions, in blocks of 2 missions."""
-    monkeypatch.setattr(sys.modules["trustbo.inference.density"], "_CHAINED", 2)
-    monkeypatch.setattr(factor, "_CHAIN_BLOCK", 6)
+    monkeypatch.setattr(sys.modules["trustbo.inference.density"], "CHAINED", 2)
+    monkeypatch.setattr(factor, "CHAIN_BLOCK", 6)
 
 
 @pytest.mark.usefixtures("chained")

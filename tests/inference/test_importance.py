@@ -84,7 +84,7 @@ def test_a_student_integrates_to_its_density():
     student = importance.Student(np.array([1.0, -1.0]), np.array([[2.0, 0.0], [0.5, 1.0]]))
 
     z, covariance = rng.normal(size=(6, 2)), student.scale @ student.scale.T
-    expected = stats.multivariate_t(student.center, covariance, df=importance._DEGREES)
+    expected = stats.multivariate_t(student.center, covariance, df=importance.DEGREES)
 
     np.testing.assert_allclose(student.log_density(z), expected.logpdf(z), rtol=1e-12)
     within = (student.draw(4096, rng) @ [1.0, 0.0] < 1.0).mean()

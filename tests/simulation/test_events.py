@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy.special import ndtri
-from worlds import hillside
+from worlds import contact_along, hillside
 
 from trustbo.errors import TrustboError
 from trustbo.simulation import (
@@ -75,9 +75,9 @@ def test_the_truth_of_a_mission_with_an_event_is_the_mean_of_many(wooded, name):
     rates = np.mean([mission.contact_rate for mission in drawn], axis=(0, 2))[1:]
     # Fouling has sd .26 / sqrt(120) = .024, three replicates some .02. The first bound begins in
     # position and is left out.
-    contact, _ = known.at(1)._along(PATH)
+    contact = contact_along(known.at(1), PATH)
     np.testing.assert_allclose(contact[1:], rates, atol=0.06)
-    before, _ = known.at(0)._along(PATH)
+    before = contact_along(known.at(0), PATH)
     assert np.abs(contact - before)[1:].max() > 0.03
 
 

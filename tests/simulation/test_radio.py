@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.stats import t as student
-from worlds import hillside, random_cells, terrain_of
+from worlds import contact_along, hillside, random_cells, terrain_of
 
 from trustbo.errors import TrustboError
 from trustbo.simulation import RadioSimulator, Truth
@@ -32,7 +32,7 @@ def test_its_truth_is_the_mean_of_its_missions(radio):
     known, n = Truth.from_simulator(radio), 1500
     rates = np.stack([radio.run(PATH, seed=seed).contact_rate.mean(1) for seed in range(n)])
     error = rates.std(0) / n**0.5
-    np.testing.assert_array_less(np.abs(known._along(PATH)[0] - rates.mean(0)), 4.5 * error)
+    np.testing.assert_array_less(np.abs(contact_along(known, PATH) - rates.mean(0)), 4.5 * error)
     assert known.at(7) is known
     best = known.best((2, 0), (0, 2))
     assert known.lost(best) <= known.lost(((2, 0), (1, 1), (0, 2)))

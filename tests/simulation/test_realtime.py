@@ -6,7 +6,7 @@ from worlds import hillside
 
 from trustbo.errors import TrustboError
 from trustbo.simulation import KinematicSimulator
-from trustbo.simulation.realtime import RealtimeAwareness
+from trustbo.simulation.realtime import RealtimeAwareness, lidar_state
 from trustbo.team import Team
 from trustbo.workspace import Workspace
 
@@ -53,9 +53,7 @@ def test_on_open_ground_all_beams_are_clear(missions):
         Workspace.from_terrain(terrain, (3, 3), Team(1), bounds=False,
                                features={"traversability": ["slope", "tri"]})
     )  # fmt: skip
-    realtime = RealtimeAwareness.__new__(RealtimeAwareness)
-    realtime._world = flat.world()
-    seen = realtime._lidar(missions[0].bounds[0].poses[:, 1:2])
+    seen = lidar_state(flat.world(), missions[0].bounds[0].poses[:, 1:2])
     return_range, visible = seen["return_range"], seen["visible_share"]
     np.testing.assert_allclose(visible, 1.0)
     np.testing.assert_allclose(return_range, 45.0)

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from worlds import hillside, random_cells
+from enumeration import every_path
+from worlds import contact_along, hillside, random_cells
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
@@ -14,7 +15,7 @@ from trustbo.simulation.replicates import edges_of, table_of
 from trustbo.team import Robot, Team
 from trustbo.terrain import TRAVERSABILITY
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, existing_bounds
+from trustbo.workspace.moves import existing_bounds
 
 PATH = ((2, 0), (1, 1), (1, 2), (0, 1))
 
@@ -47,31 +48,12 @@ def made_up(workspace, rng, some_fail=True):
     return Truth(workspace, table_of(contact, passed))
 
 
-def walks(workspace, start, goal, longest, *, u_turns):
-    """All admissible paths, by enumeration."""
-    found, passable = [], workspace.passable.values
-
-    def extend(path):
-        if path[-1] == goal:
-            found.append(tuple(path))
-        elif len(path) <= longest:
-            for down, right in MOVES:
-                r, c = path[-1][0] + down, path[-1][1] + right
-                inside = 0 <= r < passable.shape[0] and 0 <= c < passable.shape[1]
-                back = not u_turns and len(path) > 1 and (r, c) == path[-2]
-                if inside and passable[r, c] and not back:
-                    extend([*path, (r, c)])
-
-    extend([start])
-    return found
-
-
 def test_the_table_is_the_mean_of_many_missions(wooded, of_wooded):
     missions = [wooded.run(PATH, seed=seed) for seed in range(200)]
     rates = np.mean([mission.contact_rate for mission in missions], axis=(0, 2))
     # Looks add .5 / sqrt(3 x 60 ticks x 200) = .003; the first bound begins in position, which the
     # table averages with arrivals.
-    np.testing.assert_allclose(of_wooded._along(PATH)[0], rates, atol=0.02)
+    np.testing.assert_allclose(contact_along(of_wooded, PATH), rates, atol=0.02)
     assert of_wooded.lost(PATH) == pytest.approx(3.0 - rates.sum(), abs=0.03)
     assert of_wooded.lost_or_failed(PATH) == of_wooded.lost(PATH)
 
@@ -90,7 +72,7 @@ def test_tracks_that_outlast_misses_are_simulated():
     simulator = KinematicSimulator(workspace)
     found, path = Truth.from_simulator(simulator, n_replicates=20), ((1, 0), (0, 0), (0, 1))
     rates = np.mean([simulator.run(path, seed=s).contact_rate for s in range(150)], axis=(0, 2))
-    np.testing.assert_allclose(found._along(path)[0], rates, atol=0.05)
+    np.testing.assert_allclose(contact_along(found, path), rates, atol=0.05)
 
 
 def test_cached_truths_of_two_terrains_are_two(wooded, tmp_path):
@@ -133,7 +115,7 @@ class Plain:
 
 def test_any_simulator_has_a_truth():
     found = Truth.from_simulator(Plain(grid((2, 3))), n_replicates=30)
-    rates = found._along([(0, 0), (1, 0), (1, 1), (1, 2), (0, 2)])[0]
+    rates = contact_along(found, [(0, 0), (1, 0), (1, 1), (1, 2), (0, 2)])
     np.testing.assert_allclose(rates, [0.0, 0.0, 0.2, 0.8], atol=0.025)
 
 
@@ -165,9 +147,11 @@ def test_the_best_path_is_that_of_enumeration(max_bounds, failures):
         options = {"max_bounds": max_bounds}
         best = truth.best(*ends, **options, failures=failures)
         u_turns = isinstance(max_bounds, int)
-        shortest = min(len(path) - 1 for path in walks(workspace, *ends, 6, u_turns=False))
+        bounds = workspace.passable_bounds.values
+        every = every_path(bounds, *ends, 6, u_turns=False)
+        shortest = min(len(path) - 1 for path in every)
         longest = 6 if u_turns else shortest + int(max_bounds.partition("+")[2] or 0)
-        admissible = walks(workspace, *ends, longest, u_turns=u_turns)
+        admissible = every_path(bounds, *ends, longest, u_turns=u_turns)
         assert best in admissible
         assert measure(best) == pytest.approx(min(map(measure, admissible)), rel=1e-12)
         if not failures:

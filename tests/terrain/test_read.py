@@ -555,7 +555,7 @@ def test_resolution_averages_whole_numbers_of_pixels(tmp_path, monkeypatch):
     for wrong in (0.0, 200.0):
         with pytest.raises(TrustboError, match="resolution"):
             read_terrain(path, path, resolution=wrong)
-    monkeypatch.setattr("trustbo.terrain.read._MOST_PIXELS", 1000.0)
+    monkeypatch.setattr("trustbo.terrain.read.MOST_PIXELS", 1000.0)
     for large in (path, stripped):
         with pytest.raises(TrustboError, match="memory"):
             read_terrain(large)

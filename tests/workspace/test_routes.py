@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from trustbo.team import Robot
-from trustbo.workspace.routes import Routes, _a_star, largest_region
+from trustbo.workspace.routes import Routes, a_star, largest_region
 from trustbo.workspace.surface import Surface
 
 
@@ -32,7 +32,7 @@ def test_routes_cost_what_networkx_says_is_the_least(seed):
     pace = rng.uniform(1.0, (1.3, 8.0)[seed % 2], (15, 20))
     pace[rng.uniform(size=pace.shape) < 0.25] = np.inf
     pace[0, 0] = pace[14, 19] = 1.0
-    cells = _a_star(pace, pixel, (0, 0), (14, 19))
+    cells = a_star(pace, pixel, (0, 0), (14, 19))
     try:
         expected = cheapest(pace, pixel, (0, 0), (14, 19))
     except (nx.NetworkXNoPath, nx.NodeNotFound):
@@ -57,6 +57,6 @@ def test_no_way_gives_no_route():
 def test_routes_and_regions_agree_that_corners_do_not_connect():
     passable = np.zeros((60, 60), bool)
     passable[:30, :30] = passable[30:, 30:] = True
-    assert not len(_a_star(np.where(passable, 1.0, np.inf), (1.0, 1.0), (5, 5), (50, 50)))
+    assert not len(a_star(np.where(passable, 1.0, np.inf), (1.0, 1.0), (5, 5), (50, 50)))
     region = largest_region(passable)
     assert region.sum() == 900

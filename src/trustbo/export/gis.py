@@ -180,7 +180,7 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
 
     shape = shapely.Point(lon[0], lat[0])
     if np.ndim(places) == 2:
-        shape = _cut(shapely.LineString(np.column_stack([np.unwrap(lon, period=360.0), lat])))
+        shape = cut_at_180(shapely.LineString(np.column_stack([np.unwrap(lon, period=360.0), lat])))
 
     # RFC 7946, 11.2: no needless digits; the eighth decimal is about a millimetre.
     rounded = shapely.transform(shape, lambda values: np.round(values, 8))
@@ -188,7 +188,7 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
     return {"type": "Feature", "geometry": geometry, "properties": {"layer": layer, **about}}
 
 
-def _cut(line: shapely.LineString) -> shapely.Geometry:
+def cut_at_180(line: shapely.LineString) -> shapely.Geometry:
     """Cut a line at longitude 180 degrees (RFC 7946, 3.1.9); its longitudes must not jump."""
     west, _, east, _ = line.bounds
     if -180.0 <= west and east <= 180.0:

@@ -20,7 +20,7 @@ _CHUNK = 32
 """Largest number of points evaluated at once."""
 _NUMBERS = 5_000_000
 """Largest number of precision entries of the points evaluated at once."""
-_CHAINED = 100
+CHAINED = 100
 """Number of missions from which lasting effects are eliminated as chains."""
 _FEW = 15
 """Number of missions with which the search for the mode begins."""
@@ -104,7 +104,7 @@ class Density:
         self.ends = np.cumsum([0, *(U.shape[1] for U in designs)])
         self._U = self.layout.design(sparse.hstack(designs, format="csr"))
         self.exact = model.likelihood.gaussian
-        self._chained = self.exact and observations.n_missions >= _CHAINED
+        self._chained = self.exact and observations.n_missions >= CHAINED
 
         y = self.layout.rows(observations.contact_rate)
         self.blocks = Blocks.from_rows(

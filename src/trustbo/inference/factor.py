@@ -28,7 +28,7 @@ from trustbo.kernels import kernel
 from trustbo.models.backend import inverse_and_log_det, inverse_from_factor
 from trustbo.statespace.matrices import namespace
 
-_CHAIN_BLOCK = 30
+CHAIN_BLOCK = 30
 """Number of columns of a chain that are eliminated at once."""
 _DENSE = 20
 """A sparse matrix with more than one entry in this many is multiplied as a dense one in JAX."""
@@ -350,7 +350,7 @@ def chain_factor(A: Any, n_missions: int, n_chains: int) -> Any:
         return upper_factor(A)
 
     n = n_missions * n_chains
-    step = n_chains * -(-_CHAIN_BLOCK // n_chains)  # whole missions
+    step = n_chains * -(-CHAIN_BLOCK // n_chains)  # whole missions
     for one in A:
         # Block Cholesky: columns i:j of the chain are coupled to j:k and, outside of it, to n:.
         for i in range(0, n, step):

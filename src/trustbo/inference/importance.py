@@ -33,7 +33,7 @@ MAX_KHAT = 0.7
 """Largest k-hat of acceptable results."""
 ENOUGH = 400.0
 """Effective number of points at which sampling stops."""
-_DEGREES = 8.0
+DEGREES = 8.0
 """Degrees of freedom of the proposals."""
 _PRIOR_SCALE = 1.2
 """Scale of the usual defensive proposal; the prior has scale 1."""
@@ -144,7 +144,7 @@ class Student(NamedTuple):
         """Draw points (n, score) with a scrambled Sobol sequence; n must be a power of 2."""
         d = len(self.center)
         uniform = np.clip(stats.qmc.Sobol(d + 1, rng=rng).random(n), _EDGE, 1.0 - _EDGE)
-        chi2 = 2.0 * special.gammaincinv(0.5 * _DEGREES, uniform[:, d:]) / _DEGREES
+        chi2 = 2.0 * special.gammaincinv(0.5 * DEGREES, uniform[:, d:]) / DEGREES
 
         u = uniform[:, :d]
         negative = self.sides[0] / self.sides.sum(0)  # probability of a negative element
@@ -155,7 +155,7 @@ class Student(NamedTuple):
 
     def log_density(self, z: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, score)."""
-        nu = _DEGREES
+        nu = DEGREES
         d = len(self.center)
         x = solve_triangular(self.scale, (z - self.center).T, lower=True).T
         square = ((x / np.where(x < 0.0, *self.sides)) ** 2).sum(1)

@@ -12,6 +12,7 @@ import numpy as np
 from trustbo.data import Bound, Mission
 from trustbo.errors import TrustboError
 from trustbo.simulation.kinematic import KinematicSimulator
+from trustbo.simulation.world import World
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace.sight import detection_between, optics
 
@@ -68,7 +69,7 @@ class RealtimeAwareness:
 
         ahead = np.cos(poses[..., 2])
         left = np.sin(poses[..., 2])
-        state = self._lidar(poses) | {
+        state = lidar_state(world, poses) | {
             "speed_ratio": np.minimum(speed / [robot.speed for robot in world.team.robots], 1.0),
             "pitch": np.abs(np.arctan(gx * ahead + gy * left)),
             "roll": np.abs(np.arctan(gy * ahead - gx * left)),
@@ -93,22 +94,22 @@ class RealtimeAwareness:
                 z[k, :, column] = self.indices[feature].transform(inputs)
         return mission.with_awareness(z)
 
-    def _lidar(self, poses: np.ndarray) -> dict[str, np.ndarray]:
-        """Compute the mean range of returns (m) and the fraction of clear beams, (tick, robot).
 
-        The mean range is the integral over the range of the fraction of beams that reach it.
-        """
-        world = self._world
-        robot = self._world.team.robots[0]
-        low, high = np.reshape(world.surface.extent, (2, 2))
-        reach = min(robot.lidar_range, 0.5 * float((high - low).min()))
-        beams = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
-        eye = poses[..., None, None, :2]
-        target = np.clip(eye + reach * _SHARES[:, None, None] * beams, low, high)
+def lidar_state(world: World, poses: np.ndarray) -> dict[str, np.ndarray]:
+    """Compute the mean range of returns (m) and the fraction of clear beams, (tick, robot).
 
-        lidar = optics(robot, world.team.lead)
-        clear = detection_between(world.surface, world.sight, eye, target, lidar).mean(-1)
+    The mean range is the integral over the range of the fraction of beams that reach it.
+    """
+    robot = world.team.robots[0]
+    low, high = np.reshape(world.surface.extent, (2, 2))
+    reach = min(robot.lidar_range, 0.5 * float((high - low).min()))
+    beams = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+    eye = poses[..., None, None, :2]
+    target = np.clip(eye + reach * _SHARES[:, None, None] * beams, low, high)
 
-        seen = np.insert(clear, 0, 1.0, axis=-1)  # (tick, robot, 1 + share)
-        reached = np.asarray(np.trapezoid(seen, [0.0, *_SHARES], axis=-1))
-        return {"return_range": reach * reached, "visible_share": seen[..., -1]}
+    lidar = optics(robot, world.team.lead)
+    clear = detection_between(world.surface, world.sight, eye, target, lidar).mean(-1)
+
+    seen = np.insert(clear, 0, 1.0, axis=-1)  # (tick, robot, 1 + share)
+    reached = np.asarray(np.trapezoid(seen, [0.0, *_SHARES], axis=-1))
+    return {"return_range": reach * reached, "visible_share": seen[..., -1]}

@@ -36,7 +36,7 @@ from trustbo.terrain.place import (
     vertical_axis,
 )
 
-_MOST_PIXELS = 1e8  # per raster: about 3 GB while it is read
+MOST_PIXELS = 1e8  # per raster: about 3 GB while it is read
 _CLIPPED = 0.02  # fraction of pixels with the surface below the ground that causes a warning
 _UNCOVERED = 0.02  # fraction of the DEM without a surface that causes a warning
 _COARSER = 2.0  # ratio of pixel sizes from which the coarser raster smooths the heights
@@ -157,7 +157,7 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
 
 def check_size(shape: tuple[int, ...], name: str) -> None:
     """Check that a raster fits into memory."""
-    if math.prod(shape) > _MOST_PIXELS:
+    if math.prod(shape) > MOST_PIXELS:
         raise TrustboError(
             f"{name} has {shape} pixels, too many for the memory; crop it or use larger "
             "pixels, e.g. with gdalwarp -tr 5 5 -r average."

@@ -77,7 +77,7 @@ class Routes:
             self._paces[max_slope] = np.where(surface.passable, pace, np.inf)
 
         top, bottom, left, right = window
-        pixels = _a_star(
+        pixels = a_star(
             plain(self._paces[max_slope][top:bottom, left:right]),
             surface.pixel,
             (start[0] - top, start[1] - left),
@@ -95,7 +95,7 @@ def speed_share(tilt, max_slope):
 
 
 @_compiled
-def _a_star(pace, pixel, start, goal):
+def a_star(pace, pixel, start, goal):
     """Find the pixels of the fastest route by A* (Hart, Nilsson and Raphael 1968).
 
     `pace` is infinite where impassable.
