@@ -60,18 +60,6 @@ def counted_missions(family, seed=0, n=6, low=0.0):
     return z, y, missions
 
 
-def random_missions(rng, n_missions=3, n_robots=3, missing=0.2):
-    """Missions of any length, whose rates no model has drawn; some are missing."""
-    missions = []
-    for _ in range(n_missions):
-        n_bounds = int(rng.integers(1, 12))
-        rates = rng.uniform(size=(n_bounds, n_robots))
-        rates[rng.uniform(size=rates.shape) < missing] = np.nan
-        path = [(0, k) for k in range(n_bounds + 1)]
-        missions.append(Mission.from_arrays(path, rng.uniform(size=(n_bounds, n_robots, 2)), rates))
-    return missions
-
-
 def walking_missions(seed, n_missions=4, shape=(5, 5), n_bounds=(4, 10), missing=0.2):
     """Missions of three robots on random walks over a grid, whose rates no model has drawn."""
     rng, missions = np.random.default_rng(seed), []
@@ -98,12 +86,6 @@ def random_params(rng):
         x0_mean=rng.normal(0.5, 0.3),
         x0_sd=rng.uniform(0.0, 0.7),
     )
-
-
-def random_covariance(rng, n, scale):
-    """A covariance of n robots, about scale^2 on its diagonal."""
-    A = rng.normal(size=(n, n))
-    return scale**2 * (A @ A.T / n + 0.3 * np.eye(n))
 
 
 @st.composite

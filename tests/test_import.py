@@ -198,7 +198,7 @@ def test_every_imported_package_is_declared():
 
 
 def test_helpers_of_tests_are_not_in_test_files():
-    """They are in references.py, missions.py and worlds.py, also for programs that tests start."""
+    """They are in modules such as missions.py and worlds.py, also for programs that tests start."""
     imported = re.compile(r"^\s*(?:from|import) +(?:\w+\.)*(?:test_\w+|conftest)\b", re.MULTILINE)
     guilty = {
         str(path.relative_to(ROOT)): found
