@@ -91,7 +91,7 @@ def expected_rate(family, trust, sd):
     return sd * (integral(trust / sd) - integral((trust - 1.0) / sd))  # of P(rate > t) over t
 
 
-def by_quadrature(family, mean, trust_cov, noise, y, n_ticks, n_points=401):
+def by_quadrature(family, mean, trust_cov, noise, y, n_ticks, n_points=201):
     """Log density of two rates, NaN if not measured, over a grid of their linear predictors.
 
     `mean` and `trust_cov` are of trust, and `noise` is the covariance of the noise of the rates.

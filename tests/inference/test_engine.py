@@ -172,11 +172,9 @@ def test_drawn_coefficients_have_the_moments_of_the_joint_normal(name):
 PROGRAMS = {
     "pooled": GAUSSIAN,
     f"pooled, {EVERYTHING}": GAUSSIAN,
-    "pooled, deviation, robots": GAUSSIAN,
     f"pooled, deviation, shared noise, {EVERYTHING}": GAUSSIAN,
     "hierarchical, robots": GAUSSIAN,
     "hierarchical, shared noise": GAUSSIAN,
-    "coupled": GAUSSIAN,
     f"coupled, {EVERYTHING}": GAUSSIAN,
     f"pooled, deviation, {EVERYTHING}": CENSORED,
     "hierarchical, shared noise, robots": CENSORED,
