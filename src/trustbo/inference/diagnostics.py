@@ -34,7 +34,12 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
 
 
 def complaints_of(
-    draws: Mapping[str, np.ndarray], diverging: np.ndarray, most_divergences: int = 0
+    draws: Mapping[str, np.ndarray],
+    diverging: np.ndarray,
+    *,
+    max_rhat: float = MAX_RHAT,
+    min_ess: float = MIN_ESS,
+    max_divergences: int = 0,
 ) -> tuple[dict[str, float], list[str]]:
     """Compute the NUTS diagnostics of draws (chain, draw, ...), and list the failed checks."""
     flat = {name: values.reshape(*values.shape[:2], -1) for name, values in draws.items()}
@@ -51,10 +56,10 @@ def complaints_of(
     divergences = int(diverging.sum())
 
     complaints = []
-    if not worst <= MAX_RHAT:  # also true for NaN
-        complaints.append(f"R-hat is {worst:.3f} (limit {MAX_RHAT})")
-    if not least >= MIN_ESS:
-        complaints.append(f"bulk ESS is {least:.0f} (minimum {MIN_ESS:.0f})")
-    if divergences > most_divergences:
-        complaints.append(f"{divergences} transitions diverged (limit {most_divergences})")
+    if not worst <= max_rhat:  # also true for NaN
+        complaints.append(f"R-hat is {worst:.3f} (limit {max_rhat})")
+    if not least >= min_ess:
+        complaints.append(f"bulk ESS is {least:.0f} (minimum {min_ess:.0f})")
+    if divergences > max_divergences:
+        complaints.append(f"{divergences} transitions diverged (limit {max_divergences})")
     return dict(zip(NUTS_NAMES, (worst, least, divergences), strict=True)), complaints

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-
 _JITTER = 1e-12
 """Added to covariances, which may be singular, before their factors are computed."""
 _JITTER_32 = 1e-6

@@ -12,7 +12,7 @@ from trustbo.data import Mission
 from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, require_kind, warn
-from trustbo.inference.diagnostics import complaints_of
+from trustbo.inference.diagnostics import MAX_RHAT, complaints_of
 from trustbo.inference.draws import joined_draws
 from trustbo.inference.functions.data import (
     RATES,
@@ -56,6 +56,10 @@ _PATIENT = 2
 """Runs after which the chains of the drift may count instead of those of the variables."""
 _TOLERATED = 0.005
 """Share of divergent transitions that is then accepted with a warning."""
+_ROUGH_RHAT = 1.1
+"""Largest R-hat of the drift and the noises that is accepted in the end, with a warning."""
+_ROUGH_ESS = 50.0
+"""Smallest bulk ESS of the same."""
 _CHECKED = 100
 """Most measured bounds whose drift is checked."""
 _MANY = 4000
@@ -139,11 +143,17 @@ def fit_function(
             f"steps: draws of {model.in_short()} may miss narrow parts of the posterior. Narrower "
             "priors or another parametrisation help."
         )
+    r_hat = verdict.diagnostics["r_hat"]
+    if r_hat > MAX_RHAT and not verdict.complaints:
+        warn(
+            f"the posterior of {model.in_short()} is rough: R-hat of its drift and noises is "
+            f"{r_hat:.3f}, bulk ESS {verdict.diagnostics['ess_bulk']:.0f}. More draws and warmup, "
+            "narrower priors or fewer variables help."
+        )
     if verdict.not_identified:
         warn(
-            f"the chains of {joined_names(verdict.not_identified)} differ, but those of "
-            "the drift and noises agree: plans and predictions can be used, these variables "
-            "cannot. Other values of theirs may give the same drift."
+            f"the chains of {joined_names(verdict.not_identified)} differ, but those of the drift "
+            "and noises agree: plans and predictions can be used, these variables cannot."
         )
     return tree, verdict.complaints
 
@@ -324,34 +334,49 @@ class Verdict(NamedTuple):
     """Variables whose chains differ, although those of the drift and the noises agree."""
 
 
-def _judge(model: FunctionModel, data: Data, samples: Samples, *, patient: bool) -> Verdict:
+def _judge(
+    model: FunctionModel, data: Data, samples: Samples, *, patient: bool, last: bool = False
+) -> Verdict:
     """Check the chains of the variables or, if they are bad and `patient`, of what plans depend on.
 
     Variables may differ between chains although the drift does not, such as the weights of a neural
-    network, whose units can be exchanged. With `patient`, a few divergences are accepted, too.
+    network, whose units can be exchanged. With `patient`, a few divergences are accepted, too. In
+    the `last` check, the limits for the drift and the noises are wider: plans from a rough
+    posterior are better than plans that ignore a mission.
     """
     diverging = samples.fields["diverging"]
     most = int(_TOLERATED * diverging.size) if patient else 0
-    found, complaints = complaints_of(samples.z, diverging, most)
+    found, complaints = complaints_of(samples.z, diverging, max_divergences=most)
     if not complaints or not patient:
         return Verdict(found, complaints, [])
 
-    shape = diverging.shape
-    flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in samples.z.items()}
-    values = model.over_draws("constrain", 1, data)(flat)
-    space, inputs = model.over_draws("form", 2, data)(values, _keys(diverging.size, 0))
-    measured = np.flatnonzero(~np.isnan(data[RATES].ravel()))
-    some = measured[np.linspace(0, len(measured) - 1, min(_CHECKED, len(measured))).astype(int)]
-    u = (inputs.drift + inputs.offset).reshape(diverging.size, -1)[:, some]
-
-    used = {"drift": u} | {n: v for n, v in space._asdict().items() if v is not None}
-    by_chain = {name: v.reshape(*shape, -1) for name, v in used.items()}
-    found_of_drift, complaints_of_drift = complaints_of(by_chain, diverging, most)
-    if complaints_of_drift:
+    used = _used_by_plans(model, data, samples)
+    limits = {"max_rhat": _ROUGH_RHAT, "min_ess": _ROUGH_ESS} if last else {}
+    found, complaints = complaints_of(used, diverging, max_divergences=most, **limits)
+    if complaints:
         return Verdict(found, complaints, [])
 
-    alone = {name: complaints_of({name: v}, diverging, most)[1] for name, v in samples.z.items()}
-    return Verdict(found_of_drift, [], [name for name, failed in alone.items() if failed])
+    alone = {
+        name: complaints_of({name: v}, diverging, max_divergences=most)[1]
+        for name, v in samples.z.items()
+    }
+    return Verdict(found, [], [name for name, failed in alone.items() if failed])
+
+
+def _used_by_plans(model: FunctionModel, data: Data, samples: Samples) -> dict[str, np.ndarray]:
+    """Return the drift in some measured bounds and the form, each (chain, draw, number)."""
+    shape = samples.fields["diverging"].shape
+    n_draws = shape[0] * shape[1]
+    flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in samples.z.items()}
+    values = model.over_draws("constrain", 1, data)(flat)
+    space, inputs = model.over_draws("form", 2, data)(values, _keys(n_draws, 0))
+
+    measured = np.flatnonzero(~np.isnan(data[RATES].ravel()))
+    some = measured[np.linspace(0, len(measured) - 1, min(_CHECKED, len(measured))).astype(int)]
+    drift = (inputs.drift + inputs.offset).reshape(n_draws, -1)[:, some]
+
+    used = {"drift": drift} | {n: v for n, v in space._asdict().items() if v is not None}
+    return {name: v.reshape(*shape, -1) for name, v in used.items()}
 
 
 def _sampled(
@@ -400,8 +425,9 @@ def _sampled(
             accept = _LAST_ACCEPT
 
         joined = joined_samples([*runs, last])
-        verdict = _judge(model, data, joined, patient=patient)
-        if not verdict.complaints or attempt == most:
+        is_last = attempt == most
+        verdict = _judge(model, data, joined, patient=patient, last=is_last)
+        if not verdict.complaints or is_last:
             few = joined.some(draws)
             of_few = _judge(model, data, few, patient=patient)
             return (joined, verdict) if of_few.complaints else (few, of_few)
