@@ -315,16 +315,31 @@ def test_a_drift_that_depends_on_more_than_its_bound_cannot_plan(workspace, func
 
 
 def test_bad_diagnostics_are_refused_and_the_posterior_is_kept(missions):
-    """Two modes, between which chains do not move."""
+    """Two modes of the drift, between which chains do not move."""
+
+    def model(awareness, contact_rate=None):
+        modes = dist.Normal(jnp.array([-3.0, 3.0]), 0.1)
+        halves = dist.Categorical(probs=jnp.array([0.5, 0.5]))
+        a = numpyro.sample("a", dist.MixtureSameFamily(halves, modes))
+        rates = ContactRate(0.3 + 0.1 * a + 0.0 * awareness[..., 0], 0.1, 1.0, 1.0)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    with pytest.raises(PosteriorError, match=r"R-hat|bulk ESS") as error:
+        tb.fit(missions, model, seed=1, progress=False)
+    assert "posterior" in error.value.posterior.children
+
+
+def test_variables_that_are_not_identified_are_named_if_the_drift_is(missions):
+    """The sign of a does not matter, and chains keep theirs."""
 
     def model(awareness, contact_rate=None):
         a = numpyro.sample("a", dist.Normal(0.0, 1.0))
-        drift = jnp.abs(a) + 0.0 * awareness[..., 0]
-        numpyro.sample("contact_rate", ContactRate(drift, 0.1, 0.01, 0.01), obs=contact_rate)
+        rates = ContactRate(jnp.abs(a) + 0.0 * awareness[..., 0], 0.1, 0.02, 0.02)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
 
-    with pytest.raises(PosteriorError, match=r"R-hat|bulk ESS") as error:
-        tb.fit(missions, model, draws=1000, progress=False)
-    assert "posterior" in error.value.posterior.children
+    with pytest.warns(UserWarning, match="the chains of a differ"):
+        posterior = tb.fit(missions, model, latent=False, seed=1, progress=False)
+    assert posterior.attrs["not_identified"] == ["a"]
 
 
 def test_other_samplers_are_refused(missions):

@@ -32,9 +32,9 @@ def missions():
 
 def drift_of(effect, observations, theta):
     """Draw coefficients; return the values by name, and the drift (draw, mission, bound, robot)."""
-    U = effect.columns(observations).toarray()
+    U = effect.design(observations).toarray()
     c = np.random.default_rng(1).normal(size=(2, U.shape[1]))
-    values = effect.named(c, theta, observations)
+    values = effect.to_variables(c, theta, observations)
     np.testing.assert_allclose(effect.coefficients(values, theta, observations), c, rtol=1e-12)
     return values, (c @ U.T).reshape(2, *observations.contact_rate.shape)
 
@@ -145,8 +145,8 @@ def test_a_robot_s_effect_in_the_next_mission_is_normal_given_the_missions_befor
     rng = np.random.default_rng(2)
     d = rng.normal(size=(2, N_MISSIONS, N_ROBOTS))
     values = {"robot_effect": d}
-    expected = effect.ahead(values, DIFFERENT_ROBOTS, N_MISSIONS, None)
-    drawn = [effect.ahead(values, DIFFERENT_ROBOTS, N_MISSIONS, rng) for _ in range(n_draws)]
+    expected = effect.predict_next(values, DIFFERENT_ROBOTS, N_MISSIONS, None)
+    drawn = [effect.predict_next(values, DIFFERENT_ROBOTS, N_MISSIONS, rng) for _ in range(n_draws)]
 
     for point in range(2):
         # The next effect, which is last, given the others in the joint normal of all missions.

@@ -62,6 +62,8 @@ _ROUGH_ESS = 50.0
 """Smallest bulk ESS of the same."""
 _CHECKED = 100
 """Most measured bounds whose drift is checked."""
+_MOST_ATTEMPTS = 10
+"""Most runs, however short."""
 _MANY = 4000
 """Draws per chain in all runs before bad diagnostics are reported."""
 _SIZE = 200
@@ -403,7 +405,7 @@ def _sampled(
     sampler = _sampler(model)
     accept = _ACCEPT
     runs: list[Samples] = []
-    most = max(_ATTEMPTS, _MANY // draws)
+    most = min(max(_ATTEMPTS, _MANY // draws), _MOST_ATTEMPTS)
     attempt = 0
     while True:
         last = sampler.sample(
