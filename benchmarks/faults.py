@@ -69,7 +69,7 @@ FAULTS = (
     Fault("a mixture of proposals ignores their sizes", "inference/importance.py",
           "density.log_density(z) + np.log(n)", "density.log_density(z)"),
     Fault("weights that leave out a mission have the wrong sign", "inference/loo.py",
-          "smoothed(ratio + log_count)", "smoothed(log_count - ratio)"),
+          "smoothed(target.log_share - log_p,", "smoothed(target.log_share + log_p,"),
     Fault("a bound that failed is also counted as passed", "hazard/risk.py",
           "b = b + n - failed", "b = b + n"),
     Fault("the margin raises the slope limit", "hazard/prior.py",

@@ -14,7 +14,8 @@ from scipy import special, stats
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import compare, fit, loo
-from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect
+from trustbo.inference.loo import good_khat
+from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, Priors, RobotEffect
 from trustbo.models.observations import Observations
 from trustbo.workspace.moves import bounds_along
 
@@ -78,13 +79,34 @@ def test_with_places_loo_is_that_of_joint_normals():
     assert not result.warning
 
 
+def test_two_missions_are_left_out_by_refits_as_joint_normals_say():
+    """Weights of draws are too optimistic by .08 to .46 nats for two missions."""
+    missions, place = missions_with_places(seed=2)[:2], PlaceEffect()
+    result = loo(fit(missions, PooledTrust(effects=place), progress=False, check=False))
+    assert result.elpd_i["refitted"].values.all()
+    expected = dense_left_out(missions, Priors(), place)
+    # Evidence of 8192 prior points and two of some 400 of the sampler.
+    np.testing.assert_allclose(result.elpd_i, expected, atol=0.25)
+
+
+def test_the_limit_of_k_hat_falls_with_few_draws():
+    assert [round(good_khat(n), 2) for n in (1, 100, 500, 2000, 1e6)] == [
+        -2.32,
+        0.5,
+        0.63,
+        0.7,
+        0.7,
+    ]
+
+
 def test_a_mission_whose_weights_fail_is_left_out_of_a_refit(monkeypatch):
     """With a limit that no weights meet, every mission is; the densities are the same."""
     missions = simulate_missions(5, lengths=(8,))
     posterior = fit(missions, PooledTrust(), progress=False)
     by_weights = loo(posterior)
     # The package's `loo` is the function.
-    monkeypatch.setattr(importlib.import_module("trustbo.inference.loo"), "MAX_KHAT", -10.0)
+    module = importlib.import_module("trustbo.inference.loo")
+    monkeypatch.setattr(module, "good_khat", lambda n_effective: -10.0)
     with pytest.warns(UserWarning, match="Pareto"):
         by_refits = loo(posterior)
     assert by_refits.elpd_i["refitted"].values.all()

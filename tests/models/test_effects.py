@@ -12,7 +12,7 @@ N_ROBOTS = 3
 THETA = {
     "inverse_gain": np.array([0.4, 0.7]),
     "tau_slow": np.array([0.3, 0.1]),
-    "tau_day": np.array([0.2, 0.4]),
+    "tau_mission": np.array([0.2, 0.4]),
     "tau_beta": np.array([[0.3, 0.2], [0.1, 0.5]]),
     "tau_b": np.array([0.2, 0.3]),
 }
@@ -110,7 +110,7 @@ def test_a_place_changes_the_trust_of_all_robots_on_bounds_into_it(missions):
 def covariance_of_missions(point, n, rho):
     """Covariance (mission, mission) of the effects d of one robot, from its definition."""
     slow = THETA["tau_slow"][point]
-    day = THETA["tau_day"][point]
+    day = THETA["tau_mission"][point]
     cov = np.empty((n, n))
     for m in range(n):
         for other in range(n):

@@ -4,11 +4,12 @@ from trustbo.models import backend as backend  # imported first because it loads
 
 # isort: split
 from trustbo.errors import renamed_names
+from trustbo.inference.compare import compare
 from trustbo.inference.draws import sample_prior
 from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.learner import add_latent, params_of
-from trustbo.inference.loo import compare, loo
+from trustbo.inference.loo import loo
 from trustbo.inference.reports import predict_reports
 from trustbo.inference.score import score
 

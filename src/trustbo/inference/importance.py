@@ -414,8 +414,13 @@ def _finite(log_p: np.ndarray) -> np.ndarray:
     return np.nan_to_num(log_p, nan=-_LARGEST_COST, neginf=-_LARGEST_COST)
 
 
-def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:
+def smoothed(log_ratio: np.ndarray, relative: float = 1.0) -> tuple[np.ndarray, float, float]:
     """Smooth log importance ratios (point,) with a Pareto tail; at least one must be finite.
+
+    Args:
+        log_ratio: Log importance ratios.
+        relative: Effective number of points relative to the number of points, below 1 for draws of
+            a Markov chain; the tail has more points if it is small.
 
     Returns:
         Weights that sum to 1, k-hat, and the log of the mean ratio.
@@ -427,7 +432,7 @@ def smoothed(log_ratio: np.ndarray) -> tuple[np.ndarray, float, float]:
 
     # Vehtari et al. (2024) in ArviZ, which takes log likelihoods, with the opposite sign.
     kept = np.where(finite, log_ratio, log_ratio[finite].min() - _BELOW_ALL)
-    log_weight, k_hat = array_stats.psislw(-kept)
+    log_weight, k_hat = array_stats.psislw(-kept, r_eff=relative)  # pyright: ignore[reportArgumentType]
     k_hat = float(np.nan_to_num(k_hat, nan=np.inf))
     return special.softmax(log_weight), k_hat, log_mean
 

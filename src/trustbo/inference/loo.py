@@ -1,131 +1,258 @@
-"""Leave-one-mission-out cross-validation and model comparison.
+"""Leave-one-mission-out cross-validation (LOO).
 
-With coefficients, effects and trust integrated out, only the hyperparameters theta are left, and
+Draws of the posterior get importance weights 1 / p(y_j | theta, y_-j) for leaving out mission j
+(Vehtari, Gelman and Gabry 2017), so that
 
-    p(y_j | y_-j) = 1 / E[ p(y_-j | theta) / p(y | theta) | y ],
+    p(y_j | y_-j) = 1 / E[ 1 / p(y_j | theta, y_-j) | y ].
 
-so the importance weights are ratios of the evidence without and with mission j (Vehtari, Gelman and
-Gabry 2017). If coefficients were not integrated out, the weights would be poor for bounds that
-occur only in mission j.
+For a model class, coefficients, effects and trust are integrated out, theta are the hyperparameters
+alone, and p(y_j | theta, y_-j) is the ratio of the evidence with and without mission j. If
+coefficients were not integrated out, the weights would be poor for bounds that occur only in
+mission j. For a NumPyro function, theta are all variables, and p(y_j | theta) is the likelihood.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 import xarray as xr
-from arviz_stats.loo.compare import compare as ranked
+from arviz_stats import sampling_diagnostics
 from arviz_stats.utils import ELPDData
 from scipy.special import logsumexp
 
+from trustbo.data import Mission
 from trustbo.display import slow_bar
-from trustbo.errors import TrustboError, one_line, warn
+from trustbo.errors import TrustboError, warn
 from trustbo.inference.density import Density, at
-from trustbo.inference.draws import missions_of, read_posterior, require_posterior
+from trustbo.inference.draws import joined_draws, missions_of, read_posterior, require_posterior
 from trustbo.inference.fit import by_importance
+from trustbo.inference.functions.fit import fit_function, log_likelihood_of_function
+from trustbo.inference.functions.function import FunctionModel
 from trustbo.inference.importance import MAX_KHAT, smoothed
-from trustbo.models.model import TrustModel
+from trustbo.inference.learner import FunctionLearner, Model, add_latent, learner_of_posterior
 from trustbo.models.observations import Observations
 from trustbo.parallel import computing
 
+LIKELIHOOD_OF = "log_likelihood_of"
+"""Attribute of a posterior that says what its log-likelihoods are of."""
+TICKS = "ticks"
+"""Its value for log probabilities of tick counts."""
+RATES = "contact_rate"
+"""Its value for log densities of rates, and the name of the rates."""
 _POINTS = 500
 """Maximum number of distinct hyperparameter draws that are used."""
 _N_REFIT = 1000
-"""Number of draws of a refit without a mission."""
+"""Number of draws of a refit without a mission, for a function per chain."""
+_CHAINS = 4
+"""Number of chains of a refit of a function."""
+_FEWEST = 4
+"""Number of missions below which each is left out by a refit, as weights are then optimistic."""
+_LEAST_EFFECTIVE = 2.0
+"""Least effective number of draws in the limit of k-hat."""
+
+
+class LeftOut(NamedTuple):
+    """What is needed to leave out each mission of a posterior."""
+
+    contact_rate: np.ndarray
+    """Rates (mission, bound, robot)."""
+    n_ticks: np.ndarray | None
+    """Tick counts (mission, bound, robot); None if they are not known."""
+    is_density: np.ndarray
+    """Whether the likelihood of a rate is a density, not a probability, in the same shape."""
+    log_density: Callable[[int], np.ndarray]
+    """Log p(y_j | theta, y_-j) of mission j at each draw, shape (draw,)."""
+    log_likelihood: np.ndarray
+    """Log p(y_j | draw) given all variables except trust, at all draws, shape (draw, mission)."""
+    log_share: np.ndarray
+    """Log of each draw's share of all draws, shape (draw,)."""
+    n_effective: float
+    """Effective number of draws."""
+    efficiency: float
+    """Effective draws per draw of a Markov chain; 1 for independent draws."""
+    refit: Callable[[int], tuple[float, float]] | None
+    """Log p(y_j | y_-j) by a fit without mission j, and its k-hat; None if it cannot be fitted."""
 
 
 @computing()
-def loo(
-    posterior: xr.DataTree, *, model: TrustModel | None = None, progress: bool = True
-) -> ELPDData:
+def loo(posterior: xr.DataTree, *, model: Model | None = None, progress: bool = True) -> ELPDData:
     """Estimate the log predictive density of each mission given all other missions.
 
-    Hyperparameter draws get Pareto-smoothed weights. All other variables are integrated out, by
-    expectation propagation if rates are not Gaussian. If k-hat of a mission exceeds 0.7, the model
-    is refitted without that mission and the difference in log evidence is used. Missions without
-    measured rates are excluded.
+    Posterior draws get Pareto-smoothed weights. For a model class, all variables except
+    hyperparameters are integrated out, by expectation propagation if rates are not Gaussian. If
+    k-hat of a mission exceeds min(1 - 1 / log10(S), 0.7) for S effective draws (Vehtari et al.
+    2024), or if there are fewer than four missions, the model is refitted without that mission.
+    Missions without measured rates are excluded.
+
+    With few missions, the sum `elpd` is uncertain whatever k-hat is; see `compare`. `p`, the
+    effective number of parameters, should be much smaller than `n_data_points`, the number of
+    missions.
 
     Args:
-        posterior: DataTree from `fit` that includes the data.
-        model: Model of the posterior; needed if the priors are custom.
+        posterior: DataTree from `fit` that includes the data; or a DataTree from
+            `arviz.from_numpyro` with the attribute `log_likelihood_of` (see `compare`), whose
+            missions cannot be left out by refits.
+        model: Model of the posterior; needed if the priors are custom, or if it is a NumPyro
+            function that was not used before in this process.
         progress: Whether to show a progress bar after 5 seconds.
 
     Returns:
         Pointwise `ELPDData` of ArviZ for `az.compare({name: loo(posterior), ...})`. The coordinate
         `refitted` (mission,) of `elpd_i` and `pareto_k` marks refitted missions, for which
-        `pareto_k` is the k-hat of the refit.
+        `pareto_k` is the k-hat of the refit. The attribute `log_likelihood_of` of `elpd_i` says
+        whether the densities are of tick counts; only then are they comparable between observation
+        families.
 
     Raises:
-        TrustboError: If fewer than two missions have measured rates.
+        TrustboError: If fewer than two missions have measured rates, or a DataTree that is not from
+            `fit` cannot be evaluated.
     """
-    posterior = require_posterior("loo", posterior)
-    fitted, draws = read_posterior(posterior, model=model)
-    fitted.run_ep(draws.theta)
-    measured = np.flatnonzero(~np.isnan(fitted.observations.contact_rate).all((1, 2)))
-    if len(measured) < 2:
-        raise TrustboError(f"loo needs at least 2 missions with rates; got {len(measured)}.")
+    return estimated(left_out("loo", posterior, model), progress=progress)
 
-    # Resampled draws repeat, and the evidence of each distinct draw is computed only once.
-    rows = np.column_stack([v.reshape(len(draws.c), -1) for v in draws.theta.values()])
-    _, first, count = np.unique(rows, axis=0, return_index=True, return_counts=True)
-    some = np.linspace(0, len(first) - 1, min(len(first), _POINTS)).astype(int)
-    theta = at(draws.theta, first[some])
-    log_count = np.log(count[some] / count[some].sum())
 
-    whole = fitted.log_evidence(theta)
+def left_out(who: str, posterior: xr.DataTree, model: Model | None = None) -> LeftOut:
+    """Prepare to leave out each mission of a posterior; `who` is named in messages."""
+    if isinstance(posterior, xr.DataTree) and "model_record" not in posterior.attrs:
+        return _of_own(who, posterior)
+
+    posterior = require_posterior(who, posterior)
+    learner = learner_of_posterior(posterior, model)
+    if isinstance(learner, FunctionLearner):
+        return _of_function(posterior, learner.model)
+    return _of_class(posterior, model)
+
+
+def estimated(target: LeftOut, *, progress: bool = True) -> ELPDData:
+    """Leave out each mission that has rates; see `loo`."""
+    measured = np.flatnonzero(~np.isnan(target.contact_rate).all((1, 2)))
     n_measured = len(measured)
+    if n_measured < 2:
+        raise TrustboError(f"loo needs at least 2 missions with rates; got {n_measured}.")
+
+    limit = good_khat(target.n_effective)
+    n_samples = len(target.log_likelihood)
     density = np.zeros(n_measured)
-    average = np.zeros(n_measured)  # log of the mean density under the full posterior
+    average = np.zeros(n_measured)  # log of the mean likelihood under the full posterior
     k_hat = np.zeros(n_measured)
     refitted = np.zeros(n_measured, dtype=bool)
-    whole_refit = None
     with slow_bar("loo", " missions", progress, total=n_measured) as bar:
-        for i, j in enumerate(measured):
-            others = fitted.without(j)  # pyright: ignore[reportArgumentType]
-            ratio = others.log_evidence(theta) - whole
-            weight, k_hat[i], _ = smoothed(ratio + log_count)
-            density[i] = logsumexp(-ratio, b=weight)
-            average[i] = logsumexp(log_count - ratio)
+        for i, j in enumerate(map(int, measured)):
+            log_p = target.log_density(j)
+            weight, k_hat[i], _ = smoothed(target.log_share - log_p, target.efficiency)
+            density[i] = logsumexp(log_p, b=weight)
+            average[i] = logsumexp(target.log_likelihood[:, j]) - np.log(n_samples)
 
-            # p(y_j | y_-j) = p(y) / p(y_-j), each from an own fit.
-            if not k_hat[i] <= MAX_KHAT:
-                seed = int(posterior.attrs["seed"])
-                if whole_refit is None:
-                    whole_refit, _ = _log_evidence(fitted, seed)
-                rest, k_hat[i] = _log_evidence(others, seed)
-                density[i] = whole_refit - rest
+            if n_measured < _FEWEST or not k_hat[i] <= limit:
+                if target.refit is None:
+                    raise TrustboError(_no_refit(j, k_hat[i], limit, n_measured))
+                density[i], k_hat[i] = target.refit(j)
                 refitted[i] = True
             bar.update()
 
-    # Densities of tick counts are comparable between families; NaN where ticks are unknown.
-    shift = fitted.model.likelihood.log_resolution(
-        fitted.observations.contact_rate, fitted.observations.n_ticks
-    ).sum((1, 2))
-    if not np.isnan(shift).any():
-        density = density + shift[measured]
-        average = average + shift[measured]
-
-    is_bad = ~(k_hat <= MAX_KHAT)
+    is_bad = ~(k_hat <= limit)
     if is_bad.any():
         warn(
-            f"Estimated shape parameter of Pareto distribution is greater than {MAX_KHAT:.2f} for "
+            f"Estimated shape parameter of Pareto distribution is greater than {limit:.2f} for "
             f"missions {measured[is_bad].tolist()}; the results may be inaccurate."
         )
 
     elpd = float(density.sum())
     coords = {"mission": measured, "refitted": ("mission", refitted)}
+    attrs = {LIKELIHOOD_OF: RATES if target.is_density.any() else TICKS}
     return ELPDData(
         elpd=elpd,
         se=float(np.sqrt(n_measured * density.var())),
         p=float(average.sum()) - elpd,
-        n_samples=len(draws.c),
+        n_samples=n_samples,
         n_data_points=n_measured,
         scale="log",
         warning=bool(is_bad.any()),
-        good_k=MAX_KHAT,
-        elpd_i=xr.DataArray(density, coords, "mission"),
+        good_k=limit,
+        elpd_i=xr.DataArray(density, coords, "mission", attrs=attrs),
         pareto_k=xr.DataArray(k_hat, coords, "mission"),
     )
+
+
+def good_khat(n_effective: float) -> float:
+    """Return the largest k-hat at which S effective draws suffice (Vehtari et al. 2024)."""
+    return float(min(1.0 - 1.0 / np.log10(max(n_effective, _LEAST_EFFECTIVE)), MAX_KHAT))
+
+
+def _no_refit(mission: int, k_hat: float, limit: float, n_missions: int) -> str:
+    """Say why a mission needs a refit that is not possible."""
+    reason = f"k-hat of mission {mission} is {k_hat:.2f}, above {limit:.2f}"
+    if n_missions < _FEWEST:
+        reason = f"there are only {n_missions} missions"
+    return (
+        f"{reason}, so each such mission must be left out by a refit, which is not possible for an "
+        "own MCMC; fit the NumPyro function with trustbo.fit(missions, function)."
+    )
+
+
+# --- model classes ---
+
+
+def _of_class(posterior: xr.DataTree, model: Model | None) -> LeftOut:
+    """Prepare to leave out missions of a posterior of a model class."""
+    fitted, draws = read_posterior(posterior, model=model)  # pyright: ignore[reportArgumentType]
+    fitted.run_ep(draws.theta)
+    n_samples = len(draws.c)
+
+    # Resampled draws repeat, and the evidence of each distinct draw is computed only once.
+    rows = np.column_stack([v.reshape(n_samples, -1) for v in draws.theta.values()])
+    _, first, count = np.unique(rows, axis=0, return_index=True, return_counts=True)
+    some = np.linspace(0, len(first) - 1, min(len(first), _POINTS)).astype(int)
+    theta = at(draws.theta, first[some])
+    share = count[some] / count[some].sum()
+    whole = fitted.log_evidence(theta)
+
+    # Densities of tick counts are comparable between families; NaN where ticks are unknown.
+    y = fitted.observations.contact_rate
+    n_ticks = fitted.observations.n_ticks
+    is_density = ~np.isnan(y) & fitted.model.likelihood.is_density(y)
+    shift = fitted.model.likelihood.log_resolution(y, n_ticks).sum((1, 2))
+    if np.isnan(shift).any():
+        shift = np.zeros(len(y))
+    else:
+        is_density = np.zeros(y.shape, dtype=bool)
+
+    # The effective number of parameters includes coefficients and effects.
+    complete = posterior
+    if "log_likelihood" not in posterior.children:
+        complete = add_latent(posterior, model=model, progress=False)
+    log_likelihood = joined_draws(complete["log_likelihood"].to_dataset()[RATES])
+
+    seed = int(posterior.attrs["seed"])
+    known: list[float] = []  # the log evidence of all missions by a refit, once there is one
+
+    def log_density(j: int) -> np.ndarray:
+        return whole - fitted.without(j).log_evidence(theta) + shift[j]
+
+    def refit(j: int) -> tuple[float, float]:
+        """Compute p(y_j | y_-j) = p(y) / p(y_-j), each from an own fit."""
+        if not known:
+            known.append(_log_evidence(fitted, seed)[0])
+        rest, k_hat = _log_evidence(fitted.without(j), seed)
+        return known[0] - rest + float(shift[j]), k_hat
+
+    return LeftOut(
+        contact_rate=y,
+        n_ticks=n_ticks,
+        is_density=is_density,
+        log_density=log_density,
+        log_likelihood=log_likelihood,
+        log_share=np.log(share),
+        n_effective=min(1.0 / float((share**2).sum()), _n_effective(posterior)),
+        efficiency=1.0,
+        refit=refit,
+    )
+
+
+def _n_effective(posterior: xr.DataTree) -> float:
+    """Return the effective number of draws of a posterior from `fit`, by its sampler."""
+    name = "kish" if posterior.attrs["sampler"] == "importance" else "ess_bulk"
+    return float(posterior.attrs[name])
 
 
 def _log_evidence(density: Density, seed: int) -> tuple[float, float]:
@@ -134,46 +261,114 @@ def _log_evidence(density: Density, seed: int) -> tuple[float, float]:
     return summary["log_evidence"], summary["k_hat"]
 
 
-@computing()
-def compare(posteriors: Mapping[str, xr.DataTree], *, progress: bool = True) -> pd.DataFrame:
-    """Rank posteriors by leave-one-mission-out cross-validation; see `loo` and `arviz.compare`.
+# --- NumPyro functions ---
 
-    Args:
-        posteriors: Two or more posteriors from `fit` by name, fitted to the same missions. The
-            observation families may differ.
-        progress: Whether to show a progress bar after 5 seconds.
 
-    Returns:
-        Table from `arviz.compare` with one row per posterior, the best first. The columns include
-        `elpd`, `elpd_diff` and its standard error `dse` in nats, the stacking `weight`, and
-        `diag_elpd`, which names a high Pareto k.
+def _of_function(posterior: xr.DataTree, model: FunctionModel) -> LeftOut:
+    """Prepare to leave out missions of a posterior of a function."""
+    missions = missions_of(posterior)
+    observations = Observations.from_missions(missions)
+    if "log_likelihood" in posterior.children:
+        log_p = joined_draws(posterior["log_likelihood"].to_dataset()[RATES])
+        of_counts = posterior.attrs[LIKELIHOOD_OF] == TICKS
+    else:
+        log_p, of_counts = log_likelihood_of_function(posterior, missions, model)
+
+    is_measured = ~np.isnan(observations.contact_rate)
+    n_draws = len(log_p)
+    n_effective = min(_n_effective(posterior), float(n_draws))
+    seed = int(posterior.attrs["seed"])
+
+    def refit(j: int) -> tuple[float, float]:
+        """Average p(y_j | theta) over draws of a fit in which mission j has no rates."""
+        others = [_unmeasured(one) if i == j else one for i, one in enumerate(missions)]
+        fitted, complaints = fit_function(
+            others, model, None, _N_REFIT, _CHAINS, None, seed, False, posterior
+        )
+        if complaints:
+            warn(f"the refit of {model.in_short()} without mission {j}: {'; '.join(complaints)}.")
+
+        given, _ = log_likelihood_of_function(fitted, missions, model)
+        _, k_hat, log_mean = smoothed(given[:, j])
+        return log_mean, k_hat
+
+    return LeftOut(
+        contact_rate=observations.contact_rate,
+        n_ticks=observations.n_ticks,
+        is_density=is_measured & (not of_counts),
+        log_density=lambda j: log_p[:, j],
+        log_likelihood=log_p,
+        log_share=np.full(n_draws, -np.log(n_draws)),
+        n_effective=n_effective,
+        efficiency=n_effective / n_draws,
+        refit=refit,
+    )
+
+
+def _unmeasured(mission: Mission) -> Mission:
+    """Return a mission without its contact rates, which keeps the shape of the data."""
+    bounds = [
+        replace(bound, contact_rate=np.full_like(bound.contact_rate, np.nan))
+        for bound in mission.bounds
+    ]
+    return replace(mission, bounds=tuple(bounds))
+
+
+# --- a user's own MCMC ---
+
+
+def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
+    """Prepare to leave out missions of a DataTree of a user's own MCMC, without refits.
 
     Raises:
-        TrustboError: If there are fewer than two posteriors, or their rates or tick counts differ.
-
-    Example:
-        >>> tb.compare({"pooled": pooled, "hierarchical": hierarchical})
+        TrustboError: If it lacks what makes its log-likelihoods comparable.
     """
-    if not isinstance(posteriors, Mapping) or len(posteriors) < 2:
-        raise TrustboError(
-            f"compare needs a dict of two or more posteriors by name; got {one_line(posteriors)}."
-        )
-    trees = {name: require_posterior("compare", tree) for name, tree in posteriors.items()}
-
-    data_of = {name: _rates_and_ticks(tree) for name, tree in trees.items()}
-    first, *_ = data_of
-    reference = data_of[first]
-    for name, data in data_of.items():
-        if not np.array_equal(reference, data, equal_nan=True):
+    for group in ("log_likelihood", "observed_data"):
+        if group not in tree.children or RATES not in tree[group].data_vars:
             raise TrustboError(
-                f"{name!r} and {first!r} were fitted to different rates or tick counts, of shape "
-                f"{data.shape[1:]} and {reference.shape[1:]}; fit both to the same missions."
+                f"{who} needs a posterior from trustbo.fit, or one of az.from_numpyro(mcmc, "
+                f"log_likelihood=True) whose site of rates is called {RATES!r}; this DataTree has "
+                f"no {RATES!r} in the group {group!r}."
             )
 
-    return ranked({name: loo(tree, progress=progress) for name, tree in trees.items()})
+    y = np.asarray(tree["observed_data"][RATES].values, float)
+    log_p = tree["log_likelihood"].to_dataset()[RATES]
+    dims = log_p.dims
+    if y.ndim != 3 or dims[:2] != ("chain", "draw") or log_p.shape[2:] != y.shape[:1]:
+        raise TrustboError(
+            f"{who} needs one log-likelihood for each mission, with dims (chain, draw, mission), "
+            f"and rates (mission, bound, robot); got {log_p.shape} and {y.shape}."
+        )
 
+    of = tree.attrs.get(LIKELIHOOD_OF)
+    if of not in (TICKS, RATES):
+        raise TrustboError(
+            f"{who} cannot know whether the log-likelihoods of an own MCMC are of tick counts or "
+            f"densities of rates: set tree.attrs[{LIKELIHOOD_OF!r}] to {TICKS!r} if its "
+            f"ContactRate has n_ticks=, and to {RATES!r} otherwise; got {of!r}."
+        )
+    flat = joined_draws(log_p)
+    largest = flat.mean(0).max()
+    if of == TICKS and largest > 0.0:
+        raise TrustboError(
+            f"{LIKELIHOOD_OF!r} is {TICKS!r}, but a log-likelihood is {largest:.1f} > 0 and so no "
+            "log probability of counts; give n_ticks= to ContactRate."
+        )
 
-def _rates_and_ticks(posterior: xr.DataTree) -> np.ndarray:
-    """Return the contact rates and tick counts (2, mission, bound, robot) of a posterior."""
-    observations = Observations.from_missions(missions_of(posterior))
-    return np.stack([observations.contact_rate, observations.n_ticks])
+    ticks = tree["constant_data"] if "constant_data" in tree.children else {}
+    is_measured = ~np.isnan(y)
+    measured = is_measured.any((1, 2))
+    ess = sampling_diagnostics.ess(log_p.isel({dims[2]: measured}), method="bulk")
+    n_draws = len(flat)
+    n_effective = min(float(ess.min()), float(n_draws))
+    return LeftOut(
+        contact_rate=y,
+        n_ticks=np.asarray(ticks["n_ticks"].values, float) if "n_ticks" in ticks else None,
+        is_density=is_measured & (of == RATES),
+        log_density=lambda j: flat[:, j],
+        log_likelihood=flat,
+        log_share=np.full(n_draws, -np.log(n_draws)),
+        n_effective=n_effective,
+        efficiency=n_effective / n_draws,
+        refit=None,
+    )

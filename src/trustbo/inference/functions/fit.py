@@ -42,7 +42,12 @@ from trustbo.statespace.form import Inputs, StateSpace
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
 
-__all__ = ["as_model", "fit_function", "with_latent_of_function"]
+__all__ = [
+    "as_model",
+    "fit_function",
+    "log_likelihood_of_function",
+    "with_latent_of_function",
+]
 
 _WARMUP = 300
 """Warm-up draws per chain of each run of NUTS, which are discarded."""
@@ -206,9 +211,7 @@ def with_latent_of_function(
             square += (trust[where] ** 2).sum(0) / n_draws
             bar.update(len(found.log_likelihood))
 
-    is_measured = ~np.isnan(observations.contact_rate)
-    is_counted = observations.n_ticks > 0.0
-    of_counts = of_counts and bool((is_counted | ~is_measured).all())
+    of_counts = of_counts and _all_counted(observations)
 
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
@@ -230,6 +233,40 @@ def with_latent_of_function(
     whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
     whole.attrs = posterior.attrs | {"log_likelihood_of": "ticks" if of_counts else "contact_rate"}
     return whole
+
+
+def log_likelihood_of_function(
+    posterior: xr.DataTree, missions: Sequence[Mission], model: FunctionModel
+) -> tuple[np.ndarray, bool]:
+    """Compute the log-likelihood (draw, mission) of missions at all draws of a posterior.
+
+    The posterior may be given other rates of the same missions.
+
+    Returns:
+        The log-likelihoods, and whether they are of tick counts.
+    """
+    observations = Observations.from_missions(missions)
+    data = _data_for(model, missions, observations)
+    values = _padded_values(posterior, model.sites(data))
+    n_draws = len(next(iter(values.values())))
+    evaluate = model.over_draws("evaluate", 2, data)
+    keys = _keys(n_draws, posterior.attrs["seed"])
+
+    of_counts = True
+    log_likelihood = np.empty((n_draws, len(missions)))
+    for begin in range(0, n_draws, _SIZE):
+        where = slice(begin, begin + _SIZE)
+        found: Found = evaluate({name: v[where] for name, v in values.items()}, keys[where])
+        of_counts = bool(found.of_counts.all())
+        log_likelihood[where] = found.log_likelihood[:, : len(missions)]
+    return log_likelihood, of_counts and _all_counted(observations)
+
+
+def _all_counted(observations: Observations) -> bool:
+    """Return whether every measured rate has a number of ticks."""
+    is_measured = ~np.isnan(observations.contact_rate)
+    is_counted = observations.n_ticks > 0.0
+    return bool((is_counted | ~is_measured).all())
 
 
 def draws_of_function(

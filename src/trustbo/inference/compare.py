@@ -1,0 +1,127 @@
+"""Ranking of posteriors by leave-one-mission-out cross-validation."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from arviz_stats.loo.compare import compare as ranked
+from arviz_stats.utils import ELPDData
+
+from trustbo.errors import TrustboError, one_line
+from trustbo.inference.learner import Model
+from trustbo.inference.loo import LeftOut, estimated, left_out
+from trustbo.parallel import computing
+
+_LEAST_DIFFERENCE = 4.0
+"""Difference in nats below which LOO cannot tell models apart (Sivula et al. 2025)."""
+_STANDARD_ERRORS = 2.0
+"""The same in standard errors of the difference."""
+_ENOUGH_MISSIONS = 10
+"""Number of missions below which the standard error of a difference is not reliable."""
+_SINGLE = 1e-6
+"""Difference of rates that is due to single precision, which JAX uses by default."""
+
+
+@computing()
+def compare(
+    posteriors: Mapping[str, xr.DataTree],
+    *,
+    models: Mapping[str, Model] | None = None,
+    progress: bool = True,
+) -> pd.DataFrame:
+    """Rank posteriors by leave-one-mission-out cross-validation; see `loo` and `arviz.compare`.
+
+    LOO of few missions often cannot decide. The column `verdict` says `"undecided"`, with the
+    reason, if the difference to the best is below 4 nats or below two of its standard errors, or
+    there are fewer than 10 missions. The weights and the order then mean little. `p`, the effective
+    number of parameters, should be much smaller than `n_missions`.
+
+    Args:
+        posteriors: Two or more posteriors by name, fitted to the same missions: from `fit`, of
+            model classes or NumPyro functions, or from `arviz.from_numpyro(mcmc,
+            log_likelihood=True)`. The latter needs a site `contact_rate` in a plate of missions and
+            the attribute `log_likelihood_of`, `"ticks"` if its `ContactRate` has `n_ticks`, or
+            `"contact_rate"` otherwise. It is refused if a mission would need a refit.
+        models: Models by the same names; needed for models with custom priors and for NumPyro
+            functions that were not used before in this process.
+        progress: Whether to show a progress bar after 5 seconds.
+
+    Returns:
+        Table from `arviz.compare` with one row per posterior, the best first. The columns include
+        `elpd`, `p` and `n_missions`, `elpd_diff` and its standard error `dse` in nats, `verdict`,
+        the stacking `weight`, and `diag_elpd`, which names a high Pareto k.
+
+    Raises:
+        TrustboError: If there are fewer than two posteriors; their rates or tick counts differ; or
+            some log-likelihoods are of tick counts and others are densities of rates.
+
+    Example:
+        >>> tb.compare({"pooled": pooled, "hierarchical": hierarchical})
+    """
+    if not isinstance(posteriors, Mapping) or len(posteriors) < 2:
+        raise TrustboError(
+            f"compare needs a dict of two or more posteriors by name; got {one_line(posteriors)}."
+        )
+    unknown = [name for name in models or {} if name not in posteriors]
+    if unknown:
+        raise TrustboError(f"models has {unknown[0]!r}, but there is no posterior of this name.")
+
+    targets = {}
+    for name, tree in posteriors.items():
+        targets[name] = left_out(f"compare of {name!r}", tree, (models or {}).get(name))
+    _require_same_data(targets)
+
+    found = {name: estimated(target, progress=progress) for name, target in targets.items()}
+    table = ranked(found)
+    after_p = table.columns.get_loc("p") + 1  # pyright: ignore[reportOperatorIssue]
+    table.insert(after_p, "n_missions", [found[name].n_data_points for name in table.index])
+    table.insert(after_p + 1, "verdict", _verdicts(found, list(table.index)))
+    return table
+
+
+def _require_same_data(targets: Mapping[str, LeftOut]) -> None:
+    """Raise TrustboError unless all log-likelihoods are of the same data."""
+    first, *others = targets
+    reference = targets[first]
+    for name in others:
+        one = targets[name]
+        pairs = [(reference.contact_rate, one.contact_rate)]
+        if reference.n_ticks is not None and one.n_ticks is not None:
+            pairs.append((reference.n_ticks, one.n_ticks))
+        for a, b in pairs:
+            if a.shape != b.shape or not np.allclose(a, b, rtol=0.0, atol=_SINGLE, equal_nan=True):
+                raise TrustboError(
+                    f"{name!r} and {first!r} were fitted to different rates or tick counts, of "
+                    f"shape {b.shape} and {a.shape}; fit both to the same missions."
+                )
+
+        if (reference.is_density != one.is_density).any():
+            dense, other = (first, name) if reference.is_density.any() else (name, first)
+            raise TrustboError(
+                f"the log-likelihoods of {dense!r} are densities of rates, and those of {other!r} "
+                "are, at least for some rates, probabilities, so they cannot be compared; give all "
+                "missions n_ticks and, in a NumPyro function, ContactRate(..., n_ticks=n_ticks)."
+            )
+
+
+def _verdicts(found: Mapping[str, ELPDData], names: list[str]) -> list[str]:
+    """Say in words which models are worse than the first, if LOO can decide; see `compare`."""
+    best = found[names[0]]
+    verdicts = []
+    for name in names[1:]:
+        difference = found[name].elpd_i.values - best.elpd_i.values
+        size = abs(float(difference.sum()))
+        error = float(np.sqrt(len(difference) * difference.var()))
+
+        verdict = "worse"
+        if best.n_data_points < _ENOUGH_MISSIONS:
+            verdict = f"undecided: fewer than {_ENOUGH_MISSIONS} missions"
+        elif size < _LEAST_DIFFERENCE:
+            verdict = f"undecided: |elpd_diff| < {_LEAST_DIFFERENCE:.0f}"
+        elif size < _STANDARD_ERRORS * error:
+            verdict = f"undecided: |elpd_diff| < {_STANDARD_ERRORS:.0f} dse"
+        verdicts.append(verdict)
+
+    is_best = all(verdict == "worse" for verdict in verdicts)
+    return ["best" if is_best else "undecided", *verdicts]
