@@ -100,9 +100,10 @@ def test_any_model_has_any_effects_and_is_read_back_as_it_was(name):
     posterior = fit(missions, MODELS[name], check=False, **QUIET)
     fitted, draws = read_posterior(posterior)
     by_name = to_variables(fitted, draws)["posterior"]
+    axes = fitted.model.dims | fitted.model.effect_dims
     for site, values in by_name.items():
         if not site.startswith("mean_"):
-            kept = posterior["posterior"][site].values
+            kept = posterior["posterior"][site].transpose("chain", "draw", *axes[site]).values
             np.testing.assert_allclose(values, kept.reshape(values.shape), rtol=1e-9, atol=1e-12)
     params = params_of(posterior)
     assert params.leading == (400,)

@@ -4,6 +4,7 @@ from trustbo.models import backend as backend  # imported first because it loads
 
 # isort: split
 from trustbo.errors import renamed_names
+from trustbo.inference.by_rate import by_rate
 from trustbo.inference.compare import compare
 from trustbo.inference.draws import sample_prior
 from trustbo.inference.filter import TrustFilter
@@ -16,6 +17,7 @@ from trustbo.inference.score import score
 __all__ = [
     "TrustFilter",
     "add_latent",
+    "by_rate",
     "compare",
     "fit",
     "loo",

@@ -225,6 +225,8 @@ def in_order_of(
 
     if "robot" in order:
         order["robot_"] = order["robot"]  # second axis of a matrix (robot, robot)
+    if "feature" in order:
+        order["feature_"] = order["feature"]  # axis of means over robots
 
     def sort(group: xr.Dataset) -> xr.Dataset:
         return group.sel({axis: names for axis, names in order.items() if axis in group.indexes})

@@ -31,7 +31,7 @@ from trustbo.inference.importance import (
     systematic,
 )
 from trustbo.inference.place_maps import place_group
-from trustbo.inference.tree import N_PRIOR, to_datatree, with_latent
+from trustbo.inference.tree import N_PRIOR, in_label_order, to_datatree, with_latent
 from trustbo.inference.variables import draws_of, prior_parameters, to_variables
 from trustbo.models.backend import VERSIONS
 from trustbo.models.default import default_model
@@ -355,7 +355,8 @@ def _laid_out(
     prior_draws = prior_parameters(density, N_PRIOR, rng)
     groups["prior"] = {name: values[None] for name, values in prior_draws.items()}
 
-    tree = to_datatree(groups, missions, density.model.dims, density.model.effects)
+    dims = in_label_order(groups, density.model.dims)
+    tree = to_datatree(groups, missions, dims, density.model.effects)
     if places is not None:
         tree["places"] = xr.DataTree(place_group(places, density.observations.visited, seed))  # pyright: ignore[reportArgumentType]
     return tree

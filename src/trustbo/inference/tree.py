@@ -26,6 +26,12 @@ _N_TRAJECTORIES = 200
 """Kept draws of latent trust and predicted rates, evenly spaced in the chains."""
 N_PRIOR = 500
 """Number of draws in the groups `prior` and `prior_predictive`."""
+_ORDER = ("robot", "robot_", "feature", "feature_")
+"""Order of the axes of the parameters of model classes.
+
+`az.summary` labels rows wrongly if two variables have common axes in different orders, or if the
+axes of one are found in other variables first, in another order.
+"""
 _KEPT = ("posterior", "sample_stats", "prior", "hazard")
 """Groups kept by `parameters_alone`, besides those of the effects."""
 
@@ -57,6 +63,7 @@ def to_datatree(
         "robot": list(missions[0].robots),
         "robot_": list(missions[0].robots),
         "feature": list(missions[0].features),
+        "feature_": list(missions[0].features),
     }
     coords = {**(labels or {}), **coords}
     dims_of = _DIMS | parameter_dims
@@ -91,6 +98,24 @@ def to_datatree(
 
     tree["observed_data"], tree["constant_data"] = _data_groups(observed, missions, coords)
     return xr.DataTree.from_dict(tree)
+
+
+def in_label_order(
+    groups: dict[str, dict[str, Any]], parameter_dims: Mapping[str, tuple[str, ...]]
+) -> dict[str, tuple[str, ...]]:
+    """Transpose parameters (chain, draw, ...) of groups in place, as ArviZ needs for labels.
+
+    Returns:
+        The axes of the parameters by name.
+    """
+    ordered = {}
+    for name, dims in parameter_dims.items():
+        ordered[name] = tuple(sorted(dims, key=_ORDER.index))
+        axes = [2 + dims.index(dim) for dim in ordered[name]]
+        for arrays in groups.values():
+            if name in arrays:
+                arrays[name] = np.transpose(arrays[name], (0, 1, *axes))
+    return ordered
 
 
 def _data_groups(

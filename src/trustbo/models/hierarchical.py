@@ -44,12 +44,16 @@ class HierarchicalTrust(PooledTrust):
 
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
-        """See `TrustModel.dims`."""
+        """See `TrustModel.dims`.
+
+        `az.summary` would label the rows of `beta` wrongly after a variable with the axis `feature`
+        alone.
+        """
         return super().dims | {
             "beta": ("robot", "feature"),
             "b": ("robot",),
-            "mean_beta": ("feature",),
+            "mean_beta": ("feature_",),
             "mean_b": (),
-            "tau_beta": ("feature",),
+            "tau_beta": ("feature_",),
             "tau_b": (),
         }

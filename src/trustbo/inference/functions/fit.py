@@ -1,7 +1,7 @@
 """Fit a model that is a NumPyro function, and complete its posterior."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -45,6 +45,7 @@ from trustbo.workspace import Workspace
 __all__ = [
     "as_model",
     "fit_function",
+    "forms_of_function",
     "log_likelihood_of_function",
     "with_latent_of_function",
 ]
@@ -260,6 +261,28 @@ def log_likelihood_of_function(
         of_counts = bool(found.of_counts.all())
         log_likelihood[where] = found.log_likelihood[:, : len(missions)]
     return log_likelihood, of_counts and _all_counted(observations)
+
+
+def forms_of_function(
+    posterior: xr.DataTree, missions: Sequence[Mission], model: FunctionModel, some: np.ndarray
+) -> Iterator[tuple[StateSpace, Inputs, bool]]:
+    """Run a function with some draws of its posterior, given by index.
+
+    Yields:
+        For each chunk of draws, the form (draw, group, member), the inputs (draw, mission, bound,
+        group, member), and whether log-likelihoods of these missions are of tick counts.
+    """
+    observations = Observations.from_missions(missions)
+    data = _data_for(model, missions, observations)
+    values = _padded_values(posterior, model.sites(data))
+    keys = _keys(len(next(iter(values.values()))), posterior.attrs["seed"])
+    evaluate = model.over_draws("evaluate", 2, data)
+    n_missions, n_bounds = observations.contact_rate.shape[:2]
+    for begin in range(0, len(some), _SIZE):
+        where = some[begin : begin + _SIZE]
+        found: Found = evaluate({name: v[where] for name, v in values.items()}, keys[where])
+        space, inputs = _form_of(found, n_missions, n_bounds)
+        yield space, inputs, bool(found.of_counts.all()) and _all_counted(observations)
 
 
 def _all_counted(observations: Observations) -> bool:
@@ -641,4 +664,5 @@ def _sizes_of_axes(missions: Sequence[Mission]) -> dict[str, int]:
         "robot": n_robots,
         "robot_": n_robots,
         "feature": len(missions[0].features),
+        "feature_": len(missions[0].features),
     }

@@ -1,0 +1,317 @@
+"""Single contact rates as observations, for ArviZ's functions of single observations.
+
+The rates of a mission depend on each other, so the likelihood of a mission is not a product over
+rates. It is a product of predictions one step ahead (Buerkner, Gabry and Vehtari 2020),
+
+    p(y_1, ..., y_n | theta) = prod_k p(y_k | y_1, ..., y_k-1, theta),
+
+where the rates of a mission are in the order of bounds and then robots. `by_rate` returns these
+factors as log-likelihoods, and draws from the same distributions as predictions. So each rate is
+predicted from the earlier rates of its mission, and PIT values are uniform if the model is right.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from scipy import sparse
+
+from trustbo.inference.density import chunks
+from trustbo.inference.draws import missions_of, read_posterior, require_posterior
+from trustbo.inference.functions.fit import forms_of_function
+from trustbo.inference.functions.function import FunctionModel
+from trustbo.inference.learner import FunctionLearner, Model, learner_of_posterior
+from trustbo.inference.loo import LIKELIHOOD_OF, RATES, TICKS
+from trustbo.models.families import FAMILIES, Family
+from trustbo.models.observations import Observations
+from trustbo.parallel import computing
+from trustbo.statespace.blocks import Layout, LinearPredictor, each
+from trustbo.streams import stream
+
+_NUMBERS = 2_000_000
+"""Most log-likelihoods that are returned; from this number, fewer draws are."""
+_FEWEST_DRAWS = 200
+"""Draws that are returned for any number of rates."""
+_OF_RATES = ("mission", "bound", "robot")
+_PER_DRAW = ("posterior", "sample_stats", "log_prior")
+"""Groups of which the chosen draws are copied."""
+_COPIED = ("prior",)
+"""Groups that are copied as they are."""
+
+
+class Predictors(NamedTuple):
+    """Normal distribution of the linear predictors of each block, for some draws."""
+
+    mean: np.ndarray  # (draw, block, row)
+    cov: np.ndarray  # (draw, block or 1, row, row)
+    sd: np.ndarray  # own noise of rates, (draw, block or 1, row or 1)
+
+
+class _Source(NamedTuple):
+    """What the rates of a posterior are predicted with."""
+
+    observations: Observations
+    layout: Layout
+    likelihood: Family
+    predictors: Iterator[Predictors]  # of chunks of draws
+    of_counts: bool  # whether log-likelihoods are of tick counts if every rate has one
+
+
+@computing()
+def by_rate(posterior: xr.DataTree, *, model: Model | None = None) -> xr.DataTree:
+    """Return a posterior in which each contact rate is an observation, for ArviZ.
+
+    Functions such as `az.plot_loo_pit`, `az.loo_pit` and `az.metrics` need a log-likelihood and
+    predictions of single observations. Here, a rate is predicted one step ahead, from the earlier
+    rates of its mission. The log-likelihoods sum to those of missions: exactly for Gaussian rates,
+    and up to the error of moment matching (see `TrustFilter`) for other families. `az.loo` of the
+    result leaves out one such factor at a time; to leave out missions, use `loo` or `compare` of
+    the posterior itself.
+
+    Args:
+        posterior: DataTree from `fit` that includes the data.
+        model: Model of the posterior; needed if the priors are custom, or if it is a NumPyro
+            function that was not used before in this process.
+
+    Returns:
+        DataTree with the groups `log_likelihood`, `posterior_predictive`, `prior_predictive` (if
+        the posterior has it, for whole missions) and `observed_data`, each with contact_rate[...,
+        rate] for the measured rates; `constant_data` with each feature[rate]; the same draws of
+        `posterior`, `sample_stats` and `log_prior`; and `prior`. `mission`, `bound` and `robot` are
+        coordinates of the axis `rate`. If there are over 2 million log-likelihoods, fewer draws are
+        returned, evenly spaced, but at least 200.
+
+    Raises:
+        TrustboError: If the posterior is not from `fit` or contains no data.
+
+    Example:
+        >>> az.plot_loo_pit(tb.inference.by_rate(posterior))
+    """
+    posterior = require_posterior("by_rate", posterior)
+    sizes = posterior["posterior"].sizes
+    n_chains = sizes["chain"]
+    n_rates = int(posterior["observed_data"][RATES].notnull().sum()) if _has_data(posterior) else 1
+    most = max(_FEWEST_DRAWS, _NUMBERS // max(n_rates, 1)) // n_chains
+    kept = np.linspace(0, sizes["draw"] - 1, min(sizes["draw"], max(most, 1))).astype(int)
+    some = (np.arange(n_chains)[:, None] * sizes["draw"] + kept).ravel()
+
+    learner = learner_of_posterior(posterior, model)
+    if isinstance(learner, FunctionLearner):
+        source = _of_function(posterior, learner.model, some)
+    else:
+        source = _of_class(posterior, model, some)
+    log_p, predicted, of_ticks = _predicted(source, int(posterior.attrs["seed"]))
+
+    def by_chain(values: np.ndarray) -> xr.DataArray:
+        chained = values.reshape(n_chains, len(kept), -1)
+        return xr.DataArray(chained, dims=("chain", "draw", "rate"))
+
+    rates = _rates(posterior)
+    chosen = {"chain": posterior["posterior"]["chain"].values, "draw": kept}
+    coords = {name: rates[name] for name in ("rate", *_OF_RATES)}
+    groups = {
+        name: posterior[name].to_dataset().isel(draw=kept)
+        for name in _PER_DRAW
+        if name in posterior.children
+    }
+    for name in groups:
+        groups[name] = groups[name].assign_coords(draw=kept)
+    groups |= {
+        "log_likelihood": xr.Dataset({RATES: by_chain(log_p)}, coords | chosen),
+        "posterior_predictive": xr.Dataset({RATES: by_chain(predicted)}, coords | chosen),
+        "observed_data": rates.to_dataset(name=RATES),
+        "constant_data": _features(posterior, rates),
+    }
+    groups |= {name: posterior[name].to_dataset() for name in _COPIED if name in posterior.children}
+    if "prior_predictive" in posterior.children:
+        groups["prior_predictive"] = _at_rates(
+            posterior["prior_predictive"].to_dataset()[RATES], rates
+        )
+
+    tree = xr.DataTree.from_dict(groups)
+    tree.attrs = {LIKELIHOOD_OF: TICKS if of_ticks else RATES}
+    return tree
+
+
+def _has_data(posterior: xr.DataTree) -> bool:
+    """Return whether a posterior contains its data; if not, `missions_of` says what to do."""
+    return "observed_data" in posterior.children
+
+
+def _rates(posterior: xr.DataTree) -> xr.DataArray:
+    """Return the measured rates (rate,), with the coordinates mission, bound and robot."""
+    y = posterior["observed_data"].to_dataset()[RATES].transpose(*_OF_RATES)
+    is_measured = y.notnull().values
+    mission, bound, robot = np.nonzero(is_measured)
+    coords = {
+        "rate": np.arange(len(mission)),
+        "mission": ("rate", y["mission"].values[mission]),
+        "bound": ("rate", y["bound"].values[bound]),
+        "robot": ("rate", y["robot"].values[robot]),
+    }
+    return xr.DataArray(y.values[is_measured], coords, "rate")
+
+
+def _at_rates(values: xr.DataArray, rates: xr.DataArray) -> xr.Dataset:
+    """Select values (..., mission, bound, robot) at the measured rates."""
+    where = {name: rates[name] for name in _OF_RATES}
+    return values.sel(where).assign_coords(rates.coords).to_dataset(name=RATES)
+
+
+def _features(posterior: xr.DataTree, rates: xr.DataArray) -> xr.Dataset:
+    """Return each feature (rate,) by name."""
+    awareness = posterior["constant_data"].to_dataset()["awareness"]
+    features = [str(name) for name in awareness["feature"].values]
+    where = {name: rates[name] for name in _OF_RATES}
+    return xr.Dataset(
+        {name: awareness.sel(where).sel(feature=name, drop=True) for name in features}
+    ).assign_coords(rates.coords)
+
+
+# --- distributions of linear predictors ---
+
+
+def _of_class(posterior: xr.DataTree, model: Model | None, some: np.ndarray) -> _Source:
+    """Return the linear predictors of a model class, given its coefficients."""
+    fitted, draws = read_posterior(posterior, model=model)  # pyright: ignore[reportArgumentType]
+    draws = draws.at(some)
+    observations = fitted.observations
+    layout = fitted.model.layout(observations, contrasts=False)
+    terms = [effect.design(observations) for effect in fitted.model.terms]
+    design = layout.design(sparse.hstack(terms, format="csr"))
+
+    def predictors() -> Iterator[Predictors]:
+        for where, theta in chunks(draws.theta):
+            predictor = fitted.model.linear_predictor(theta, observations, layout)
+            inputs = (design @ draws.c[where].T).T
+            inputs = inputs.reshape(len(inputs), len(layout.label), -1)
+            yield _given(predictor, inputs, 0.0, layout.label)
+
+    return _Source(observations, layout, fitted.model.likelihood, predictors(), True)
+
+
+def _of_function(posterior: xr.DataTree, model: FunctionModel, some: np.ndarray) -> _Source:
+    """Return the linear predictors of a function."""
+    missions = missions_of(posterior)
+    observations = Observations.from_missions(missions)
+    shape = observations.contact_rate.shape
+    first, forms = _peeked(forms_of_function(posterior, missions, model, some))
+    space, _, of_counts = first
+    layout = Layout(shape, joint=space.n_members > 1)  # pyright: ignore[reportArgumentType]
+
+    # Blocks are missions or, if robots are independent, (mission, robot), and robots may differ.
+    label = layout.label
+    if not layout.joint:
+        label = np.tile(np.arange(shape[2]), shape[0])
+
+    def predictors() -> Iterator[Predictors]:
+        for space, inputs, _ in forms:
+            predictor = LinearPredictor.from_space(space, layout)
+            n_draws = len(space.transition)
+            drift = np.asarray(inputs.drift).reshape(n_draws, *shape)
+            offset = np.asarray(inputs.offset).reshape(n_draws, *shape)
+            yield _given(predictor, layout.rows(drift), layout.rows(offset), label)
+
+    return _Source(observations, layout, FAMILIES["gaussian"], predictors(), of_counts)
+
+
+def _peeked[T](items: Iterator[T]) -> tuple[T, Iterator[T]]:
+    """Return the first item, and all items."""
+    first = next(items)
+
+    def every() -> Iterator[T]:
+        yield first
+        yield from items
+
+    return first, every()
+
+
+def _given(
+    predictor: LinearPredictor, inputs: np.ndarray, offset: np.ndarray | float, label: np.ndarray
+) -> Predictors:
+    """Return the distribution of the linear predictors given inputs (draw, block, input)."""
+    response = each(predictor.response, label)
+    mean = each(predictor.mean, label) + (response @ inputs[..., None])[..., 0] + offset
+    return Predictors(mean, each(predictor.covariance, label), each(predictor.noise_sd, label))
+
+
+# --- predictions one step ahead ---
+
+
+def _predicted(source: _Source, seed: int) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Predict each measured rate from the earlier rates of its mission.
+
+    Returns:
+        Log-likelihoods (draw, rate), predicted rates (draw, rate), and whether the log-likelihoods
+        are of tick counts.
+    """
+    observations = source.observations
+    likelihood = source.likelihood
+    is_measured = ~np.isnan(observations.contact_rate)
+    y = source.layout.rows(observations.contact_rate)
+    n_ticks = source.layout.rows(observations.n_ticks)
+    rng = stream(seed, "by rate")
+
+    log_p = []
+    predicted = []
+    for some in source.predictors:
+        found = one_step_ahead(some, y, n_ticks, likelihood, rng)
+        of_rates, drawn = (source.layout.unstack(values)[:, is_measured] for values in found)
+        log_p.append(of_rates)
+        predicted.append(drawn)
+
+    # Log likelihoods of tick counts are comparable between families; NaN where ticks are unknown.
+    shift = likelihood.log_resolution(observations.contact_rate, observations.n_ticks)
+    of_ticks = source.of_counts and not np.isnan(shift).any()
+    joined = np.concatenate(log_p)
+    if of_ticks:
+        joined = joined + shift[is_measured]
+    return joined, np.concatenate(predicted), of_ticks
+
+
+def one_step_ahead(
+    predictors: Predictors,
+    y: np.ndarray,
+    n_ticks: np.ndarray,
+    likelihood: Family,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Predict the rate of each row from the earlier rows of its block.
+
+    The linear predictors f of a block are jointly normal, and are updated as in `kalman.update`.
+
+    Args:
+        predictors: Distribution of the linear predictors before any rate.
+        y: Rates (block, row); NaN where not measured.
+        n_ticks: Tick counts (block, row).
+        likelihood: Observation family.
+        rng: Random number generator.
+
+    Returns:
+        Log p(y_k | y_1..k-1), 0 where not measured, and draws of y_k given y_1..k-1; each of shape
+        (draw, block, row).
+    """
+    mean = predictors.mean
+    shape = mean.shape
+    cov = np.broadcast_to(predictors.cov, (*shape, shape[-1]))
+    sd = np.broadcast_to(predictors.sd, shape)
+    log_p = np.zeros(shape)
+    drawn = np.full(shape, np.nan)
+    for k in range(shape[-1]):
+        if np.isnan(y[:, k]).all():
+            continue
+
+        m = mean[..., k]
+        v = cov[..., k, k]
+        f = m + np.sqrt(v) * rng.standard_normal(m.shape)
+        drawn[..., k] = likelihood.sample(f, sd[..., k], n_ticks[:, k], rng)
+        log_p[..., k], after, left = likelihood.moment_match(
+            y[:, k], n_ticks[:, k], m, v, sd[..., k]
+        )
+
+        gain = cov[..., k] / v[..., None]
+        mean = mean + gain * (after - m)[..., None]
+        cov = cov - gain[..., :, None] * gain[..., None, :] * (v - left)[..., None, None]
+
+    return log_p, drawn
