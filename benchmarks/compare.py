@@ -1,6 +1,6 @@
 """Differences in LOO between one model fitted as a class, a function and an own NumPyro MCMC.
 
-    python benchmarks/compare.py [-n 6 20] [--seeds 1]
+    python benchmarks/compare.py ["fit, NUTS"] [own] ... [-n 6 20] [--seeds 1]
 
 The missions are driven by the kinematic simulator on the example hillside, and all their rates have
 `n_ticks`. The model is `PooledTrust()`, written down again as a NumPyro function for the two other
@@ -34,11 +34,21 @@ TARGET = 3.0
 SHAPE = 10, 10
 ENDS = (9, 0), (0, 9)
 OF = "log_likelihood_of"
+REFERENCE = "fit, importance"
+WAYS = (
+    REFERENCE,
+    "fit, NUTS",
+    "fit, function",
+    "own",
+    "own, az.compare",
+    "own, densities",
+)
+"""Ways to fit the model, which are the rows."""
 
 
 def main():
     """Print a table for each number of missions."""
-    parser = arguments(__doc__, seeds=1)
+    parser = arguments(__doc__, names=WAYS, seeds=1)
     parser.add_argument("-n", type=int, nargs="+", default=[6, 20], help="numbers of missions")
     given = parsed(parser)
     warnings.filterwarnings("ignore", category=UserWarning)  # k-hat is shown in the table
@@ -46,7 +56,7 @@ def main():
     data = hillside(max(given.n))
     for n in given.n:
         print(f"\n{n} missions, {rates_of(data[:n]).size} rates\n")
-        one_table(data[:n], given.seeds)
+        one_table(data[:n], given.seeds, given.names)
 
 
 def hillside(n):
@@ -66,11 +76,11 @@ def rates_of(data):
     return rates[~np.isnan(rates)]
 
 
-def one_table(data, n_seeds):
+def one_table(data, n_seeds, names):
     """Print the rows of all ways to fit the model to these missions."""
     model = program(data[0].features)
     ways = {
-        "fit, importance": lambda seed: tb.fit(data, tb.models.PooledTrust(), seed=seed),
+        REFERENCE: lambda seed: tb.fit(data, tb.models.PooledTrust(), seed=seed),
         "fit, NUTS": lambda seed: tb.fit(
             data, tb.models.PooledTrust(), sampler="nuts", seed=seed, progress=False
         ),
@@ -84,9 +94,9 @@ def one_table(data, n_seeds):
         "posterior", "elpd", "difference", "standard error", "sd over seeds", "p", "largest k-hat",
         "refits", "s of the fit", f"< {TARGET:.0f} nats", first=16,
     )  # fmt: skip
-    reference = [loo(ways["fit, importance"](seed), progress=False) for seed in range(n_seeds)]
-    for name, fit in ways.items():
-        one_row(table, name, fit, reference)
+    reference = [loo(ways[REFERENCE](seed), progress=False) for seed in range(n_seeds)]
+    for name in names:
+        one_row(table, name, ways[name], reference)
 
 
 def one_row(table, name, fit, reference):
