@@ -8,8 +8,8 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
+from dense_statespace import mission_of_params
 from missions import counted_missions, simulate_missions, walking_missions
-from references import dense_log_likelihood
 from scipy import stats
 
 from trustbo.errors import TrustboError
@@ -23,6 +23,7 @@ from trustbo.models import (
     PlaceEffect,
     PooledTrust,
     RobotEffect,
+    TrustParams,
 )
 from trustbo.models.families import FAMILIES
 
@@ -68,9 +69,11 @@ def test_each_rate_is_predicted_from_the_earlier_ones_of_its_robot():
     x0 = [posterior.attrs[name] for name in ("x0_mean", "x0_sd")]
     robots = missions[0].robots
     for mission, bound, i in ((0, 1, 0), (0, 4, 2), (2, 8, 1)):
-        z, y = missions[mission].awareness[:, i], missions[mission].contact_rate[:, i]
+        z = missions[mission].awareness[:, [i]]
+        y = missions[mission].contact_rate[:, [i]]
+        params = TrustParams(*parameters, *x0)
         upto = [
-            dense_log_likelihood(*parameters, *x0, z[:k], y[:k]) if k else 0.0
+            mission_of_params(params, z[:k]).log_density(y[:k]) if k else 0.0
             for k in (bound, bound - 1)
         ]
         is_it = (found["mission"] == mission) & (found["bound"] == bound)

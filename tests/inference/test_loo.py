@@ -15,7 +15,7 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import compare, fit, loo
 from trustbo.inference.loo import good_khat
-from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, Priors, RobotEffect
+from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.observations import Observations
 from trustbo.workspace.moves import bounds_along
 
@@ -81,11 +81,11 @@ def test_with_places_loo_is_that_of_joint_normals():
 
 def test_two_missions_are_left_out_by_refits_as_joint_normals_say():
     """Weights of draws are too optimistic by .08 to .46 nats for two missions."""
-    missions, place = missions_with_places(seed=2)[:2], PlaceEffect()
-    result = loo(fit(missions, PooledTrust(effects=place), progress=False, check=False))
+    missions, model = missions_with_places(seed=2)[:2], PooledTrust(effects=PlaceEffect())
+    result = loo(fit(missions, model, progress=False, check=False))
     assert result.elpd_i["refitted"].values.all()
-    expected = dense_left_out(missions, Priors(), place)
-    # Evidence of 8192 prior points and two of some 400 of the sampler.
+    expected = dense_left_out(missions, model)
+    # Evidence of 4096 prior points and two of some 400 of the sampler.
     np.testing.assert_allclose(result.elpd_i, expected, atol=0.25)
 
 

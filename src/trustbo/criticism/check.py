@@ -216,7 +216,7 @@ def _weights(posterior: xr.DataTree, group: str, name: str) -> np.ndarray:
     """Return the draws of the weights in a group, (draw, feature), of all robots."""
     weights = joined_draws(posterior[group].to_dataset()[name])
     if name == "B":  # keep the weights of each robot's own features, which have an expected sign
-        weights = np.einsum("dmii->dim", weights)
+        weights = np.einsum("diim->dim", weights)
     return weights.reshape(-1, weights.shape[-1])
 
 
