@@ -160,7 +160,7 @@ def fit(
         if sampler not in (None, "nuts"):
             raise TrustboError(f"a NumPyro function is sampled by 'nuts'; got {sampler!r}.")
         tree, complaints = of_function.fit_function(
-            missions, function, workspace, draws, chains, warmup, seed, progress, start
+            missions, function, workspace, draws, chains, warmup, seed, progress, check, start
         )
         add_latent = partial(
             of_function.with_latent_of_function,

@@ -93,11 +93,12 @@ def fit_function(
     warmup: int | None,
     seed: int,
     progress: bool,
+    check: bool,
     start: xr.DataTree | None,
 ) -> tuple[xr.DataTree, list[str]]:
     """Fit a function to missions with NUTS; for the arguments, see `trustbo.fit`.
 
-    If the diagnostics are bad, NUTS goes on; see `_sampled`.
+    If the diagnostics are bad and `check` is true, NUTS goes on; see `_sampled`.
 
     Returns:
         The posterior of the parameters, and a list of failed checks.
@@ -114,7 +115,7 @@ def fit_function(
 
     first = _start(model, sites, data, start, chains, seed)
     samples, verdict = _sampled(
-        model, data, sites, first, warmup, draws, seed=seed, progress=progress
+        model, data, sites, first, warmup, draws, seed=seed, progress=progress, check=check
     )
     stats = {ours: samples.fields[theirs] for theirs, ours in _STATS.items()}
     stats["lp"] = -stats["lp"]  # NumPyro's potential is -log density
@@ -451,6 +452,7 @@ def _sampled(
     *,
     seed: int,
     progress: bool,
+    check: bool,
 ) -> tuple[Samples, Verdict]:
     """Run NUTS until the diagnostics are good, or until it has had many draws.
 
@@ -465,7 +467,7 @@ def _sampled(
     sampler = _sampler(model)
     accept = _ACCEPT
     runs: list[Samples] = []
-    most = min(max(_ATTEMPTS, _MANY // draws), _MOST_ATTEMPTS)
+    most = min(max(_ATTEMPTS, _MANY // draws), _MOST_ATTEMPTS) if check else 1
     attempt = 0
     while True:
         last = sampler.sample(
