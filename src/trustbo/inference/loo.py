@@ -283,7 +283,7 @@ def _of_function(posterior: xr.DataTree, model: FunctionModel) -> LeftOut:
         """Average p(y_j | theta) over draws of a fit in which mission j has no rates."""
         others = [_unmeasured(one) if i == j else one for i, one in enumerate(missions)]
         fitted, complaints = fit_function(
-            others, model, None, _N_REFIT, _CHAINS, None, seed, False, posterior
+            others, model, None, _N_REFIT, _CHAINS, None, seed, False, True, posterior
         )
         if complaints:
             warn(f"the refit of {model.in_short()} without mission {j}: {'; '.join(complaints)}.")

@@ -3,14 +3,20 @@
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.pooled import PooledTrust
+from trustbo.models.priors import Priors
 
 
-def default_model(*, places: bool = True) -> PooledTrust:
+def default_model(*, places: bool = True, priors: Priors | None = None) -> PooledTrust:
     """Make the default model, which is `PooledTrust` with place and robot effects.
 
     Args:
         places: Whether to include place effects, which need missions with a map.
+        priors: Priors on the parameters; by default those for the features (see
+            `Priors.from_features`). `PooledTrust(priors=...)` would have no effects.
+
+    Example:
+        >>> priors = dataclasses.replace(tb.models.Priors.from_features(features), delta_v=0.1)
+        >>> tb.iterate(workspace, (9, 0), (0, 9), model=tb.models.default_model(priors=priors))
     """
-    if not places:
-        return PooledTrust(effects=(RobotEffect(),))
-    return PooledTrust(effects=(PlaceEffect(), RobotEffect()))
+    effects = (PlaceEffect(), RobotEffect()) if places else (RobotEffect(),)
+    return PooledTrust(effects=effects) if priors is None else PooledTrust(priors, effects=effects)
