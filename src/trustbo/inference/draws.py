@@ -57,7 +57,7 @@ def require_posterior(who: str, value: object) -> xr.DataTree:
     return value
 
 
-def parameters_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
+def parameters_of(posterior: xr.DataTree, model: TrustModel | None = None) -> dict[str, np.ndarray]:
     """Return the parameter draws of a posterior by name, with chains joined in an axis (draw,).
 
     Variables that the model does not have, such as a user's own, are left out.
@@ -66,7 +66,8 @@ def parameters_of(posterior: xr.DataTree) -> dict[str, np.ndarray]:
         TrustboError: If a parameter has other dims than the model's, or a draw is NaN, for example
             after masking with xarray.
     """
-    model = with_default_priors(json.loads(posterior.attrs["model_record"]))
+    if model is None:
+        model = model_of(posterior)
     axes = model.dims | model.effect_dims
     draws = posterior["posterior"].to_dataset()
 
@@ -132,7 +133,8 @@ def _read_params(
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         posterior = in_order_of(posterior, workspace.team.names, workspace.features)
 
-    parameters = parameters_of(posterior)
+    model = model_of(posterior)
+    parameters = parameters_of(posterior, model)
     needed = ("B0", "B") if "B0" in parameters else ("beta0", "beta", "b", "delta_w", "delta_v")
     missing = [name for name in needed if name not in parameters]
     if missing:
@@ -149,21 +151,24 @@ def _read_params(
 
     found = []
     for is_drawn in next_mission:
-        ahead = parameters | _robot_effects_ahead(posterior, parameters, is_drawn)
+        ahead = parameters | _robot_effects_ahead(posterior, model, parameters, is_drawn)
         params = assemble_params(ahead, x0, memory)
         found.append(params._replace(**maps))  # pyright: ignore
     return found
 
 
 def _robot_effects_ahead(
-    posterior: xr.DataTree, parameters: Mapping[str, np.ndarray], next_mission: bool
+    posterior: xr.DataTree,
+    model: TrustModel,
+    parameters: Mapping[str, np.ndarray],
+    next_mission: bool,
 ) -> dict[str, np.ndarray]:
     """Return the parameters (draw, robot, ...) that robot effects change in the next mission."""
-    effects = [e for e in effects_of(posterior) if not isinstance(e, PlaceEffect)]
+    effects = [e for e in model.effects if not isinstance(e, PlaceEffect)]
     if not effects:
         return {}
 
-    theta = theta_of(posterior, parameters)
+    theta = model.derived(parameters)
     rng = np.random.default_rng(_NEXT_MISSION_SEED) if next_mission else None
     n_draws = len(theta["inverse_gain"])
     n_robots = posterior.attrs["n_robots"]
@@ -239,7 +244,7 @@ def in_order_of(
 
 
 def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
-    """Return the effects in the model of a posterior."""
+    """Return the effects in the model of a posterior; none for a function."""
     return effects_from_record(json.loads(posterior.attrs["model_record"]))
 
 
@@ -257,7 +262,12 @@ def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
 
 def theta_of(posterior: xr.DataTree, parameters: Mapping[str, np.ndarray]) -> Theta:
     """Return the hyperparameters of draws by name, including `inverse_gain`; see `Theta`."""
-    return with_default_priors(json.loads(posterior.attrs["model_record"])).derived(parameters)
+    return model_of(posterior).derived(parameters)
+
+
+def model_of(posterior: xr.DataTree) -> TrustModel:
+    """Return the model of a posterior with default priors, on which draws do not depend."""
+    return with_default_priors(json.loads(posterior.attrs["model_record"]))
 
 
 def read_posterior(

@@ -101,6 +101,12 @@ class Learner(Protocol):
         """Return all draws of a posterior; see `params_of`."""
         ...
 
+    def expected_and_drawn(
+        self, posterior: xr.DataTree, workspace: Workspace | None
+    ) -> tuple[Draws, Draws]:
+        """Return `draws` without and with `next_mission`; the posterior is read once."""
+        ...
+
     def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
         """Draw parameters from the prior, with a leading axis (draw,)."""
         ...
@@ -177,6 +183,12 @@ class ClassLearner:
         """See `Learner.draws`."""
         return params_of_model(posterior, workspace, next_mission=next_mission)
 
+    def expected_and_drawn(
+        self, posterior: xr.DataTree, workspace: Workspace | None
+    ) -> tuple[Draws, Draws]:
+        """See `Learner.expected_and_drawn`."""
+        return expected_and_drawn_of_model(posterior, workspace)
+
     def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
         """See `Learner.prior_draws`."""
         features = workspace.features
@@ -245,6 +257,13 @@ class FunctionLearner:
     ) -> Draws:
         """See `Learner.draws`; variables of one mission are always drawn for the next one."""
         return draws_of_function(self.model, posterior, workspace)
+
+    def expected_and_drawn(
+        self, posterior: xr.DataTree, workspace: Workspace | None
+    ) -> tuple[Draws, Draws]:
+        """See `Learner.expected_and_drawn`."""
+        draws = self.draws(posterior, workspace)
+        return draws, draws
 
     def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> FunctionDraws:
         """See `Learner.prior_draws`."""
@@ -343,11 +362,7 @@ def expected_and_drawn(
 ) -> tuple[Draws, Draws]:
     """Return `params_of` without and with `next_mission`; the posterior is read once."""
     require_posterior("params_of", posterior)
-    learner = learner_of_posterior(posterior)
-    if isinstance(learner, FunctionLearner):
-        draws = learner.draws(posterior, workspace)
-        return draws, draws
-    return expected_and_drawn_of_model(posterior, workspace)
+    return learner_of_posterior(posterior).expected_and_drawn(posterior, workspace)
 
 
 @computing()

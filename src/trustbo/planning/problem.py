@@ -332,10 +332,13 @@ def draws_of(
     """
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior, workspace, next_mission=next_mission)
+    return _require_draws(posterior)
 
-    draws: Draws = require_kind(
-        "posterior", posterior, Draws, "give a posterior from fit, or parameters"
-    )
+
+def _require_draws(given: object) -> Draws:
+    """Return draws that can be used, with at most one leading axis (draw,)."""
+    remedy = "give a posterior from fit, or parameters"
+    draws: Draws = require_kind("posterior", given, Draws, remedy)
     draws.require_valid()
     return draws.flat() if len(draws.leading) > 1 else draws
 
@@ -358,7 +361,7 @@ def mean_and_draws_of(
         expected, drawn = expected_and_drawn(params, workspace)
         return expected.mean(), drawn
 
-    draws = draws_of(params, workspace)
+    draws = _require_draws(params)
     if not draws.leading:
         return draws, None
     return draws.mean(), draws
