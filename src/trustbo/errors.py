@@ -1,5 +1,6 @@
 """Errors that trustbo raises for invalid input; each is also a ValueError."""
 
+import contextlib
 import functools
 import inspect
 import math
@@ -9,7 +10,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-_PACKAGE = str(Path(__file__).parent)
+_NOT_CALLERS = str(Path(__file__).parent), contextlib.__file__
+"""Code that no warning points at: the package, and the decorators of its functions."""
 
 
 class TrustboError(ValueError):
@@ -32,7 +34,7 @@ class PosteriorError(TrustboError):
 
 def warn(message: str) -> None:
     """Issue a UserWarning that points at the line outside of trustbo that made the call."""
-    warnings.warn(message, stacklevel=2, skip_file_prefixes=(_PACKAGE,))
+    warnings.warn(message, stacklevel=2, skip_file_prefixes=_NOT_CALLERS)
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
