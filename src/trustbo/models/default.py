@@ -15,7 +15,8 @@ def default_model(*, places: bool = True, priors: Priors | None = None) -> Poole
             `Priors.from_features`). `PooledTrust(priors=...)` would have no effects.
 
     Example:
-        >>> priors = dataclasses.replace(tb.models.Priors.from_features(features), delta_v=0.1)
+        >>> priors = tb.models.Priors.from_features(workspace.features)
+        >>> priors = dataclasses.replace(priors, delta_v=dist.HalfNormal(0.05))
         >>> tb.iterate(workspace, (9, 0), (0, 9), model=tb.models.default_model(priors=priors))
     """
     effects = (PlaceEffect(), RobotEffect()) if places else (RobotEffect(),)
