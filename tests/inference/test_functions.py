@@ -11,6 +11,7 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
+from numpyro.handlers import reparam
 from numpyro.infer.util import log_density
 from scipy import stats
 
@@ -247,6 +248,11 @@ def discrete(awareness, rates):
     numpyro.sample("contact_rate", ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1), obs=rates)
 
 
+def named_draw(awareness, rates):
+    a = numpyro.sample("draw", dist.Normal())
+    numpyro.sample("contact_rate", ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1), obs=rates)
+
+
 def without_variables(awareness, rates):
     numpyro.sample("contact_rate", ContactRate(awareness[..., 0], 0.5, 0.1, 0.1), obs=rates)
 
@@ -261,6 +267,7 @@ def broken(awareness, rates):
         (refused(without_site), "has no site 'contact_rate', only 'a'"),
         (refused(normal), "has the distribution Normal; it must be tb.models.ContactRate"),
         (refused(unobserved), "is not observed; pass obs=contact_rate"),
+        (refused(named_draw), "has the name of an axis"),
         (refused(discrete), "the site 'a' .* is discrete"),
         (refused(without_variables), "has no latent variable"),
         (refused(broken), "failed with RuntimeError: no such luck"),
@@ -300,6 +307,18 @@ def with_offset(awareness, rates):
     numpyro.sample("contact_rate", given, obs=rates)
 
 
+def without_plate(awareness, rates):
+    a = numpyro.sample("a", dist.Normal().expand([len(awareness)]).to_event(1))
+    drift = a[:, None, None] + awareness[..., 0]
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
+
+
+def with_rough_noise(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    noise = 0.1 * (1.0 + awareness.mean())
+    numpyro.sample("contact_rate", ContactRate(a + awareness[..., 0], 0.5, noise, 0.1), obs=rates)
+
+
 @pytest.mark.parametrize(
     ("function", "message"),
     [
@@ -307,6 +326,8 @@ def with_offset(awareness, rates):
         (with_history, "changes with the order"),
         (standardised, "changes with the order"),
         (with_offset, "has an offset"),
+        (without_plate, "a size that depends on the number of missions"),
+        (with_rough_noise, "a noise or the trust at the start depends on the awareness"),
     ],
 )
 def test_a_drift_that_depends_on_more_than_its_bound_cannot_plan(workspace, function, message):
@@ -367,6 +388,139 @@ def test_a_fingerprint_tells_functions_apart_but_not_their_comments():
         functools.partial(shaped, n=2)
     )
     assert as_model(linear) is as_model(linear)
+
+
+def closed(*values):
+    return lambda awareness, contact_rate=None: values
+
+
+def inner(awareness, contact_rate=None):
+    return jax.vmap(lambda z: SCALES["slope"] * z)(awareness)
+
+
+def jitted(factor):
+    return jax.jit(lambda awareness, contact_rate=None: factor * awareness)
+
+
+class Callable:
+    def __init__(self, n):
+        self.n = n
+
+    def __call__(self, awareness, contact_rate=None):
+        return self.n
+
+
+def first_wrapped(awareness, contact_rate=None):
+    return awareness + 1.0
+
+
+def second_wrapped(awareness, contact_rate=None):
+    return awareness + 2.0
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (closed(1, 2, 1), closed(1, 2, 2)),
+        (closed(dist.Normal(0.0, 1.0)), closed(dist.Normal(0.0, 2.0))),
+        (closed(lambda x: x), closed(lambda x: 2.0 * x)),
+        (functools.partial(shaped, n=max), functools.partial(shaped, n=min)),
+        (functools.partial(shaped, a=lambda x: x), functools.partial(shaped, b=lambda x: x)),
+        (jitted(1.0), jitted(2.0)),
+        (Callable(1), Callable(2)),
+        (reparam(config={})(first_wrapped), reparam(config={})(second_wrapped)),
+        (reparam(first_wrapped, config={}), reparam(second_wrapped, config={})),
+    ],
+)
+def test_a_fingerprint_contains_what_a_function_refers_to(one, other):
+    assert fingerprint(one) != fingerprint(other)
+
+
+SCALES = {"slope": 1.0}
+PRIOR = dist.Normal(0.0, 1e-3)
+
+
+def with_global_prior(awareness, contact_rate=None):
+    a = numpyro.sample("a", PRIOR)
+    rates = ContactRate(a + 0.0 * awareness[..., 0], 0.4, 0.05, 0.05)
+    numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+def test_globals_that_change_change_the_fingerprint(monkeypatch):
+    before = fingerprint(inner), fingerprint(with_global_prior)
+    monkeypatch.setitem(SCALES, "slope", 2.0)
+    assert fingerprint(inner) != before[0]
+
+    model = as_model(with_global_prior)
+    monkeypatch.setitem(globals(), "PRIOR", dist.Normal(0.0, 1.0))
+    assert fingerprint(with_global_prior) != before[1]
+    assert as_model(with_global_prior) is not model  # not what was compiled with the old prior
+
+
+def test_a_fingerprint_without_source_is_the_same_in_other_processes():
+    script = (
+        "from trustbo.inference.functions.function import fingerprint as f\n"
+        "space = {}\n"
+        "exec('def m(awareness, contact_rate=None): return (lambda x: x)(1)', space)\n"
+        "print(f(space['m']))"
+    )
+    run = [subprocess.run([sys.executable, "-c", script], capture_output=True) for _ in range(2)]
+    assert run[0].stdout == run[1].stdout != b""
+
+
+def test_log_priors_of_missions_leave_out_the_padding(missions):
+    fitted = tb.fit(missions, by_mission, draws=100, check=False, progress=False)
+    off = fitted["posterior"]["off"].values
+    np.testing.assert_allclose(
+        fitted["log_prior"]["off"], stats.norm.logpdf(off, 0.0, 0.05).sum(-1)
+    )
+
+
+@pytest.mark.parametrize("name", ["trust", "level/of"])
+def test_a_variable_may_have_any_name(missions, name):
+    def model(awareness, contact_rate=None):
+        a = numpyro.sample(name, dist.Normal(0.0, 1.0))
+        rates = ContactRate(a + 0.0 * awareness[..., 0], 0.4, 0.05, 0.05)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    fitted = tb.fit(missions, model, draws=100, check=False, progress=False)
+    assert name.replace("/", ".") in fitted["posterior"]
+    assert name.replace("/", ".") in fitted["log_prior"]
+
+
+def test_a_drift_may_depend_on_the_duration(missions):
+    """Short missions are padded, and NaN in the padding would make all gradients NaN."""
+    timed = [
+        tb.Mission.from_arrays(
+            one.path, one.awareness, one.contact_rate, np.full(one.contact_rate.shape, 60.0),
+            features=FEATURES, robots=one.robots,
+        )
+        for one in missions
+    ]  # fmt: skip
+
+    def model(awareness, contact_rate=None, duration=None):
+        a = numpyro.sample("a", dist.Normal(0.0, 1.0))
+        rates = ContactRate(a * duration / 60.0 + 0.0 * awareness[..., 0], 0.4, 0.05, 0.05)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    fitted = tb.fit(timed, model, draws=200, check=False, latent=False, progress=False)
+    assert fitted.attrs["divergences"] == 0
+
+
+def test_a_path_may_jump_if_the_function_reads_no_moves(missions):
+    cells = [missions[0].path[0], (2, 2), (0, 4)]
+    z = missions[0].awareness[:2]
+    jump = tb.Mission.from_arrays(
+        cells, z, missions[0].contact_rate[:2], features=FEATURES, robots=missions[0].robots
+    )
+    fitted = tb.fit([jump, *missions], linear, draws=100, check=False, progress=False)
+    assert fitted["posterior"]["level"].shape == (4, 100)
+
+    def of_moves(awareness, contact_rate=None, bound=None):
+        linear(awareness, contact_rate)
+
+    with pytest.raises(tb.TrustboError, match="not neighbours"):
+        tb.fit([jump, *missions], of_moves, progress=False)
 
 
 @pytest.mark.slow

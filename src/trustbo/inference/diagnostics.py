@@ -42,7 +42,10 @@ def complaints_of(
     max_divergences: int = 0,
 ) -> tuple[dict[str, float], list[str]]:
     """Compute the NUTS diagnostics of draws (chain, draw, ...), and list the failed checks."""
-    flat = {name: values.reshape(*values.shape[:2], -1) for name, values in draws.items()}
+    flat = {  # in a DataTree, "/" separates groups
+        name.replace("/", "."): values.reshape(*values.shape[:2], -1)
+        for name, values in draws.items()
+    }
 
     # Parameters that are constant in the model have no diagnostics.
     free = {name: v[:, :, np.ptp(v, axis=(0, 1)) > 0.0] for name, v in flat.items()}

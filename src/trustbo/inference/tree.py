@@ -78,7 +78,11 @@ def to_datatree(
         used = set()
         shape = (0, 0)  # of chains and draws
         for name, array in arrays.items():
-            dims = ("mission",) if group.endswith("log_likelihood") else dims_of.get(name, ())
+            dims = dims_of.get(name, ())
+            if group.endswith("log_likelihood"):
+                dims = ("mission",)
+            elif group == "log_prior":
+                dims = ()
             kept = array[(..., *(slice(len(coords[d])) for d in dims))]
             if "bound" in dims:
                 kept = np.where(ended, np.nan, kept)

@@ -29,10 +29,14 @@ The shapes are awareness (mission, bound, robot, feature); contact_rate, n_ticks
 """
 
 
-def data_of(missions: Sequence[Mission], observations: Observations) -> dict[str, np.ndarray]:
+def data_of(
+    missions: Sequence[Mission], observations: Observations, *, moves: bool = True
+) -> dict[str, np.ndarray]:
     """Return the inputs of missions, padded so that a function is compiled for few shapes.
 
-    In the padding, contact_rate, n_ticks and duration are NaN, awareness is 0, and indices are -1.
+    In the padding, contact_rate is NaN, indices are -1, and the other inputs are 0, because a drift
+    of NaN would make gradients NaN, even in bounds without rates.
+    Without `moves`, moves are -1, so that paths may jump; with `moves`, a jump is a TrustboError.
     """
     n_missions, n_bounds = observations.contact_rate.shape[:2]
     missing = (
@@ -40,13 +44,18 @@ def data_of(missions: Sequence[Mission], observations: Observations) -> dict[str
         (0, -n_bounds % _STEP_OF_BOUNDS),
     )
 
-    duration = np.full(observations.contact_rate.shape, np.nan)
+    n_ticks = np.zeros(observations.contact_rate.shape)
+    duration = np.zeros(observations.contact_rate.shape)
     bound = np.full((n_missions, n_bounds, 3), _UNKNOWN)
     for j, mission in enumerate(missions):
         driven = slice(len(mission.bounds))
+        n_ticks[j, driven] = mission.n_ticks
         duration[j, driven] = mission.duration
         if mission.path:
-            bound[j, driven] = bounds_along(mission.path)[: len(mission.bounds)]
+            path = mission.path[: len(mission.bounds) + 1]  # failed missions do not complete it
+            bound[j, driven, 1:] = path[1:]
+            if moves:
+                bound[j, driven] = bounds_along(path)
 
     def padded(values: np.ndarray, fill: float) -> np.ndarray:
         margin = [*missing, *[(0, 0)] * (values.ndim - 2)]
@@ -55,8 +64,8 @@ def data_of(missions: Sequence[Mission], observations: Observations) -> dict[str
     return {
         "awareness": padded(observations.awareness, 0.0),
         RATES: padded(observations.contact_rate, np.nan),
-        "n_ticks": padded(observations.n_ticks, np.nan),
-        "duration": padded(duration, np.nan),
+        "n_ticks": padded(n_ticks, 0.0),
+        "duration": padded(duration, 0.0),
         "cell": padded(bound[..., 1:], _UNKNOWN),
         "bound": padded(bound, _UNKNOWN),
     }
@@ -64,6 +73,8 @@ def data_of(missions: Sequence[Mission], observations: Observations) -> dict[str
 
 def data_of_bounds(awareness: np.ndarray, bounds: np.ndarray) -> dict[str, np.ndarray]:
     """Return the inputs of bounds as one mission without contact rates, padded as in `data_of`.
+
+    The number of ticks and the duration, which are not known before a mission, are NaN.
 
     Args:
         awareness: Awareness, shape (bound, robot, feature), without NaN.

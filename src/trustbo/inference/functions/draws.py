@@ -184,6 +184,8 @@ class FunctionDraws(Draws):
             keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(_SEED), numbers)
         space, inputs = self.model.over_draws("form", 2, data)(values, keys)
 
+        if inputs.drift.shape[1:3] != data["awareness"].shape[:2]:
+            raise TrustboError(self._wrong_size())
         offset = np.any(inputs.offset)
         if offset or not np.isfinite(inputs.drift).all():
             reason = "has an offset" if offset else "has a drift that is not finite"
@@ -194,6 +196,14 @@ class FunctionDraws(Draws):
 
         fields = [None if value is None else value[:, 0] for value in space]
         return StateSpace(*fields), inputs
+
+    def _wrong_size(self) -> str:
+        """Say that a variable of all missions cannot be used for the next one."""
+        return (
+            f"a variable of {self.model.in_short()} has a size that depends on the number of "
+            "missions or bounds, so it cannot plan; sample variables of one mission each within "
+            'numpyro.plate("mission", len(awareness)).'
+        )
 
     def _data(self, z: np.ndarray, bounds: np.ndarray) -> dict[str, Any]:
         """Return the inputs of bounds; `z` has the shape (bound, robot, feature)."""
@@ -212,7 +222,7 @@ class FunctionDraws(Draws):
         """Raise TrustboError if the drift of a bound depends on anything but this bound.
 
         The function runs on the bounds of the map as one mission, and on half of them, in another
-        order, as two missions. The drift of a bound must be the same.
+        order, as two missions. The drift of a bound, and the parameters, must be the same.
 
         Args:
             awareness: Awareness of the map, shape (robot, move, row, col, feature).
@@ -227,7 +237,8 @@ class FunctionDraws(Draws):
         # Variables of one mission each are the same in all runs.
         data = some._data(z, bounds)
         of_missions = some._drawn_for_mission(data)
-        _, inputs = some._run(some.values | of_missions, some._numbers, data)
+        first, inputs = some._run(some.values | of_missions, some._numbers, data)
+        shapes = {name: site.shape for name, site in some.model.sites(data).items()}
         wanted = _by_robot(inputs)[:, 0, : len(z)]
 
         order = np.random.default_rng(0).permutation(len(z))[: max(1, len(z) // 2)]
@@ -238,11 +249,15 @@ class FunctionDraws(Draws):
         if some.model.needs_observations:
             data["observations"] = observations_of(data, some.features)
         sites = some.model.sites(data)
+        if any(
+            shapes.get(name) != site.shape for name, site in sites.items() if name in self.values
+        ):
+            raise TrustboError(self._wrong_size())
         twice = {
             name: np.repeat(values, 2, axis=1 + (sites[name].mission_axis or 0))
             for name, values in of_missions.items()
         }
-        _, inputs = some._run(some.values | twice, some._numbers, data)
+        second, inputs = some._run(some.values | twice, some._numbers, data)
         found = _by_robot(inputs).reshape(len(wanted), -1, self.n_robots)[:, : len(order)]
 
         error = np.abs(found - wanted[:, order]).max(initial=0.0)
@@ -251,6 +266,14 @@ class FunctionDraws(Draws):
                 f"{self.model.in_short()} cannot plan: the drift of a bound changes with the order "
                 "or the number of bounds or missions. It may depend only on the awareness, the "
                 "cell and the move of the same bound."
+            )
+
+        pairs = [(a, b) for a, b in zip(first, second, strict=True) if a is not None]
+        if not all(np.allclose(a, b, rtol=_SAME, atol=_SAME) for a, b in pairs):
+            raise TrustboError(
+                f"{self.model.in_short()} cannot plan: beta0, a noise or the trust at the start "
+                "depends on the awareness or the number of missions; make it depend on sampled "
+                "variables alone."
             )
 
     def _drawn_for_mission(self, data: Data) -> dict[str, np.ndarray]:

@@ -195,8 +195,8 @@ def with_latent_of_function(
     log_likelihood = np.empty((n_draws, n_missions))
     log_prior: dict[str, list[np.ndarray]] = {}
     of_counts = True
-    trust = np.empty((n_draws, *shape))
-    predicted = np.empty((n_draws, *shape))
+    trust = np.empty((len(some), *shape))
+    predicted = np.empty((len(some), *shape))
     with slow_bar("latent trust", " draws", progress, total=n_draws) as bar:
         for begin in range(0, n_draws, _SIZE):
             where = slice(begin, begin + _SIZE)
@@ -204,13 +204,18 @@ def with_latent_of_function(
             of_counts = bool(found.of_counts.all())
             log_likelihood[where] = found.log_likelihood[:, :n_missions]
             for name, of_site in found.log_prior.items():
-                log_prior.setdefault(name, []).append(of_site)
+                own = _without_padding(of_site[None], sites[name], n_missions)[0]
+                log_prior.setdefault(safe(name), []).append(own.reshape(len(own), -1).sum(1))
 
             space, inputs = _form_of(found, n_missions, shape[1])
-            trust[where] = _drawn_trust(space, inputs, observations, rng)
-            predicted[where] = _replicated(space, inputs, observations, rng)
-            mean += trust[where].sum(0) / n_draws
-            square += (trust[where] ** 2).sum(0) / n_draws
+            x = _drawn_trust(space, inputs, observations, rng)
+            rates = _replicated(space, inputs, observations, rng)
+            mean += x.sum(0) / n_draws
+            square += (x**2).sum(0) / n_draws
+
+            first, last = np.searchsorted(some, (begin, begin + len(x)))
+            trust[first:last] = x[some[first:last] - begin]
+            predicted[first:last] = rates[some[first:last] - begin]
             bar.update(len(found.log_likelihood))
 
     of_counts = of_counts and _all_counted(observations)
@@ -221,12 +226,12 @@ def with_latent_of_function(
     groups = {
         "log_likelihood": {"contact_rate": by_chain(log_likelihood)},
         "latent": {
-            "trust": by_chain(trust[some]),
+            "trust": by_chain(trust),
             "trust_mean": mean,
             "trust_sd": np.sqrt(np.maximum(square - mean**2, 0.0)),
             "draw": kept,
         },
-        "posterior_predictive": {"contact_rate": by_chain(predicted[some]), "draw": kept},
+        "posterior_predictive": {"contact_rate": by_chain(predicted), "draw": kept},
         "prior_predictive": {"contact_rate": _prior_predictive(model, data, observations, seed)},
         "log_prior": {n: by_chain(np.concatenate(parts)) for n, parts in log_prior.items()},
     }
@@ -362,7 +367,7 @@ def _data_for(
     model: FunctionModel, missions: Sequence[Mission], observations: Observations
 ) -> dict[str, Any]:
     """Return the inputs of a function; data that it takes as one object are not padded."""
-    data: dict[str, Any] = data_of(missions, observations)
+    data: dict[str, Any] = data_of(missions, observations, moves="bound" in model.inputs)
     if model.needs_observations:
         n_missions, n_bounds = observations.contact_rate.shape[:2]
         data = {name: values[:n_missions, :n_bounds] for name, values in data.items()}

@@ -10,14 +10,16 @@ import textwrap
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from functools import cached_property
+from types import CodeType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
-from numpyro.distributions import biject_to
+from numpyro.distributions import Distribution, biject_to
 from numpyro.infer.util import constrain_fn, potential_energy
+from numpyro.primitives import Messenger
 
 from trustbo.display import joined
 from trustbo.errors import TrustboError
@@ -36,6 +38,8 @@ _HOW = (
 )
 _MOST_KNOWN = 64
 """Number of functions that are remembered, with what was compiled for them."""
+_AXES = ("chain", "draw")
+"""Names that no variable may have."""
 _HASH_LENGTH = 16
 """Number of hexadecimal digits of a hash."""
 
@@ -58,12 +62,11 @@ class Found(NamedTuple):
     space: StateSpace
     inputs: Inputs
     log_prior: dict[str, Any]
-    """Log prior density of each variable."""
+    """Log prior density of each element of each variable, in the shape of its plates."""
     log_likelihood: Any
     """Log density of each mission's rates, or log probability of its counts, shape (mission,)."""
     of_counts: Any
     """Whether `log_likelihood` is of tick counts if every rate has one."""
-    deterministic: dict[str, Any]
 
 
 class FunctionModel:
@@ -191,6 +194,11 @@ class FunctionModel:
                     f"the site {name!r} of {self.in_short()} is discrete, and NUTS samples "
                     "continuous variables only; sum over its values."
                 )
+            if free and name in _AXES:
+                raise TrustboError(
+                    f"the site {name!r} of {self.in_short()} has the name of an axis of "
+                    "posteriors; give it another name."
+                )
 
     # --- functions that are compiled once for each shape of their arguments ---
 
@@ -220,16 +228,10 @@ class FunctionModel:
             space=rates.space,
             inputs=rates.inputs,
             log_prior={
-                name: jnp.sum(trace[name]["fn"].log_prob(trace[name]["value"]))
-                for name in _latent(trace)
+                name: trace[name]["fn"].log_prob(trace[name]["value"]) for name in _latent(trace)
             },
             log_likelihood=rates.log_prob(trace[RATES]["value"]),
             of_counts=jnp.asarray(rates.n_ticks is not None),
-            deterministic={
-                name: site["value"]
-                for name, site in trace.items()
-                if site["type"] == "deterministic"
-            },
         )
 
     def form(
@@ -288,6 +290,7 @@ class _explained:  # noqa: N801
 
 
 _KNOWN: OrderedDict[str, FunctionModel] = OrderedDict()
+"""Models of functions by fingerprint, the last used one last."""
 
 
 def as_model(function: Callable[..., Any] | FunctionModel) -> FunctionModel:
@@ -344,7 +347,10 @@ def is_of_function(record: Mapping[str, Any]) -> bool:
 
 def _inputs_of(function: Callable[..., Any], name: str) -> tuple[str, ...]:
     """Return the names of a function's inputs; raises TrustboError if they are wrong."""
-    parameters = inspect.signature(function).parameters
+    inner: Any = function
+    while isinstance(inner, Messenger):  # such as `handlers.reparam`
+        inner = inner.fn
+    parameters = inspect.signature(inner).parameters
     takes = tuple(one for one in parameters if one in NAMES)
     if "observations" not in takes:
         for needed in ("awareness", RATES):
@@ -402,21 +408,17 @@ def _site(site: Mapping[str, Any], free: Any, plates: set[str]) -> Site:
 def fingerprint(function: Callable[..., Any]) -> str:
     """Return a hash of a function: its code, without comments, and the values that it refers to.
 
-    Values are defaults, variables of enclosing functions, and global functions and constants of
-    the same module. Functions of other modules are identified by their names.
+    Values are defaults, variables of enclosing functions, and global variables. Modules, classes,
+    and functions of other modules are identified by their names alone.
     """
     parts: list[str] = []
-    _describe(function, parts, set())
+    _describe(function, parts, {})
     text = "\n".join(parts)
     return hashlib.sha256(text.encode()).hexdigest()[:_HASH_LENGTH]
 
 
-def _describe(value: Any, parts: list[str], seen: set[int]) -> None:
-    """Add texts to `parts` that tell a value from others."""
-    if id(value) in seen:
-        return
-    seen.add(id(value))
-
+def _describe(value: Any, parts: list[str], seen: dict[int, int]) -> None:
+    """Add texts to `parts` that tell a value from others; `seen` numbers the functions so far."""
     if isinstance(value, TrustModel):
         parts.append(json.dumps(model_to_record(value), sort_keys=True))
     elif inspect.ismethod(value):
@@ -425,48 +427,120 @@ def _describe(value: Any, parts: list[str], seen: set[int]) -> None:
     elif inspect.isfunction(value):
         _describe_function(value, parts, seen)
     elif isinstance(value, functools.partial):
-        for one in (value.func, *value.args, *value.keywords.items()):
+        for one in (value.func, value.args, value.keywords):
             _describe(one, parts, seen)
     elif isinstance(value, np.ndarray | jax.Array):
         array = np.asarray(value)
         parts.append(f"{array.dtype} {array.shape} {hashlib.sha256(array.tobytes()).hexdigest()}")
+    elif isinstance(value, list | tuple | dict):
+        _describe_items(value, parts, seen)
+    elif _is_wrapper(value) or isinstance(value, Distribution | Messenger):
+        _describe_object(value, parts, seen)
     else:
-        parts.append(_text_of(value))
+        _describe_other(value, parts, seen)
 
 
-def _describe_function(function: Callable[..., Any], parts: list[str], seen: set[int]) -> None:
+def _describe_items(value: Any, parts: list[str], seen: dict[int, int]) -> None:
+    """Describe the items of a list, a tuple or a dict."""
+    parts.append(f"{type(value).__name__} {len(value)}")
+    if isinstance(value, dict):
+        parts.extend(map(str, value))
+        value = value.values()
+    for one in value:
+        _describe(one, parts, seen)
+
+
+def _describe_function(
+    function: Callable[..., Any], parts: list[str], seen: dict[int, int]
+) -> None:
     """Describe the code of a function and the values that it refers to."""
+    if id(function) in seen:  # a recursive function, or one that is used twice
+        parts.append(f"function {seen[id(function)]}")
+        return
+
+    seen[id(function)] = len(seen)
     parts.append(_code_of(function))
     defaults = function.__defaults__ or ()
     by_keyword = function.__kwdefaults__ or {}
     enclosed = [_content(cell) for cell in function.__closure__ or ()]
     for one in (*defaults, *by_keyword.values(), *enclosed):
         _describe(one, parts, seen)
-    for name in sorted(function.__code__.co_names):
+    for name in sorted(_names_in(function.__code__)):
         _describe_global(function, name, parts, seen)
 
 
+def _names_in(code: CodeType) -> set[str]:
+    """Return the names of globals and attributes in a code, including its inner functions."""
+    inner = [_names_in(one) for one in code.co_consts if isinstance(one, CodeType)]
+    return {*code.co_names}.union(*inner)
+
+
 def _describe_global(
-    function: Callable[..., Any], name: str, parts: list[str], seen: set[int]
+    function: Callable[..., Any], name: str, parts: list[str], seen: dict[int, int]
 ) -> None:
-    """Describe a global function or constant of the same module that a function refers to."""
-    value = function.__globals__.get(name)
+    """Describe a global variable that a function refers to; see `fingerprint`."""
+    if name not in function.__globals__:
+        return
+
+    value = function.__globals__[name]
     is_own = getattr(value, "__module__", None) == function.__module__
-    if inspect.isfunction(value) and is_own:
-        _describe(value, parts, seen)
-    elif isinstance(value, bool | int | float | str | tuple | np.ndarray | jax.Array):
+    is_function = inspect.isroutine(value) or _is_wrapper(value)
+    if inspect.ismodule(value) or inspect.isclass(value) or (is_function and not is_own):
+        return
+    if not is_function:
         parts.append(name)
-        _describe(value, parts, seen)
+    _describe(value, parts, seen)
+
+
+def _is_wrapper(value: Any) -> bool:
+    """Return whether a value wraps a function, such as `jax.jit`."""
+    return not isinstance(value, type) and callable(getattr(value, "__wrapped__", None))
+
+
+def _describe_object(value: Any, parts: list[str], seen: dict[int, int]) -> None:
+    """Describe an object by its class and attributes, and by the function that it wraps."""
+    parts.append(_kind_of(value))
+    if _is_wrapper(value):
+        _describe(value.__wrapped__, parts, seen)
+    attributes = vars(value) if hasattr(value, "__dict__") else {}
+    _describe({n: v for n, v in attributes.items() if not n.startswith("__")}, parts, seen)
+
+
+def _describe_other(value: Any, parts: list[str], seen: dict[int, int]) -> None:
+    """Describe a value that can be pickled; others are told apart by their kinds only.
+
+    Pickle refers to the class of an object by name, so the code of `__call__` is added.
+    """
+    try:  # the text must be the same in other processes
+        parts.append(hashlib.sha256(pickle.dumps(value, protocol=4)).hexdigest())
+    except Exception:
+        parts.append(_kind_of(value))
+
+    call = getattr(type(value), "__call__", None)  # noqa: B004
+    if inspect.isfunction(call):
+        _describe(call, parts, seen)
 
 
 def _code_of(function: Callable[..., Any]) -> str:
-    """Return the code of a function without comments, or its byte code if there is no source."""
+    """Return the code of a function without comments, or its byte code if there is no source.
+
+    Lambdas have no source of their own, because several can be in one line.
+    """
+    if function.__name__ == "<lambda>":
+        return _byte_code_of(function.__code__)
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError):
-        code = function.__code__
-        return f"{code.co_code.hex()} {code.co_consts!r} {code.co_names!r}"
+        return _byte_code_of(function.__code__)
     return ast.unparse(tree)
+
+
+def _byte_code_of(code: CodeType) -> str:
+    """Return a byte code as text, the same in other processes."""
+    constants = [
+        _byte_code_of(one) if isinstance(one, CodeType) else repr(one) for one in code.co_consts
+    ]
+    return f"{code.co_code.hex()} {constants} {code.co_names!r}"
 
 
 def _content(cell: Any) -> Any:
@@ -477,9 +551,6 @@ def _content(cell: Any) -> Any:
         return None
 
 
-def _text_of(value: Any) -> str:
-    """Return a text that tells a value from others, the same in other processes."""
-    try:
-        return hashlib.sha256(pickle.dumps(value, protocol=4)).hexdigest()
-    except Exception:  # values that cannot be pickled are told apart by their kind only
-        return f"{type(value).__module__}.{type(value).__qualname__}"
+def _kind_of(value: Any) -> str:
+    """Return the module and name of the class of a value."""
+    return f"{type(value).__module__}.{type(value).__qualname__}"

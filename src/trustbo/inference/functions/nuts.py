@@ -124,7 +124,8 @@ class Sampler:
         if not np.isfinite(fields["potential_energy"]).all():
             raise TrustboError(
                 f"{self.model.in_short()} has no finite density at the starts of the chains. Check "
-                "that delta_w and delta_v are positive and that the drift is finite."
+                "that delta_w and delta_v are positive and that the drift is finite, also where an "
+                "input such as duration or n_ticks is NaN (jnp.nan_to_num)."
             )
         return Samples(z, fields, float(step_size.mean()))
 
@@ -177,6 +178,9 @@ class Sampler:
             return x[warmup:], kept, last.adapt_state.step_size
 
         run = jax.jit(jax.vmap(chain, in_axes=(0, 0, None, None, None, None)))
+        if fixed is not None:  # forget what was compiled for the data of earlier fits
+            for key in [key for key in self._compiled if key[-1] != fixed]:
+                self._compiled.pop(key, None)
         self._compiled[known] = run
         return run
 
