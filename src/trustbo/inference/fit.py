@@ -78,11 +78,11 @@ def fit(
 
     Args:
         missions: Missions of one team; NaN marks contact rates that were not measured.
-        model: Trust model, or a NumPyro function `model(awareness, contact_rate=None)` (see the
-            how-to "Your own model"). By default `models.default_model()` with place and robot
-            effects; place effects are omitted if a mission has no map or a path jumps. For reports
-            of people (see `logs.read_reports`), the default is `HumanTrust` with the scale of the
-            reports.
+        model: Trust model, or a NumPyro function `model(awareness, contact_rate=None)` (see
+            `models.ContactRate` and the how-to "Your own model"). By default
+            `models.default_model()` with place and robot effects; place effects are omitted if a
+            mission has no map or a path jumps. For reports of people (see `logs.read_reports`), the
+            default is `HumanTrust` with the scale of the reports.
         sampler: `"importance"` takes independent draws by adaptive importance sampling without
             compilation, and integrates out all variables except hyperparameters. `"nuts"` uses
             NumPyro's NUTS, which also samples trust unless rates are Gaussian. By default

@@ -22,7 +22,7 @@ class Latent(NamedTuple):
 
     trust: np.ndarray  # (kept draw, mission, bound, robot)
     mean: np.ndarray  # (mission, bound, robot), over all draws
-    sd: np.ndarray
+    sd: np.ndarray  # (mission, bound, robot), over all draws
     log_likelihood: np.ndarray  # (draw, mission)
     predicted: np.ndarray  # (kept draw, mission, bound, robot), replicated rates
 

@@ -66,7 +66,7 @@ class Whitened(NamedTuple):
     """
 
     location: np.ndarray  # (score,)
-    scale: np.ndarray
+    scale: np.ndarray  # (score,), as the next three
     skew: np.ndarray
     weight: np.ndarray
     center: np.ndarray

@@ -46,7 +46,7 @@ def predict_reports(
     Reports at the same bound are not used to predict each other.
 
     Args:
-        posterior: Density of `HumanTrust`.
+        posterior: Posterior of `HumanTrust`.
         missions: One mission per person; NaN reports are also predicted.
         given: `"earlier"` to use earlier reports of the person, or `"none"` to use no reports.
         fitted: Whether the posterior was fitted to the earlier reports of these persons. If so,

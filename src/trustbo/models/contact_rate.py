@@ -24,12 +24,30 @@ class ContactRate(dist.Distribution):
 
     These are equations (3)-(4) of the paper. If beta0, delta_w or delta_v is a matrix, they are
     (1)-(2). The batch shape is (mission,) and the event shape is (bound, robot). NaN marks rates
-    that were not measured. `drift` may be any function of awareness and other sampled parameters:
+    that were not measured.
 
-    >>> drift = level + most * (1.0 - jnp.exp(-rise * awareness[..., 1]))
-    >>> with numpyro.plate("mission", len(drift)):
-    ...     rates = ContactRate(drift, beta0, delta_w, delta_v)
-    ...     numpyro.sample("contact_rate", rates, obs=contact_rate)
+    For `tb.fit` and `tb.Campaign`, give a function with this distribution at the site
+    `contact_rate`. `drift` may be any JAX function of the inputs and of sampled variables:
+
+    >>> def saturating(awareness, contact_rate=None):
+    ...     rise = numpyro.sample("rise", dist.HalfNormal(0.5))
+    ...     with numpyro.plate("robot", awareness.shape[2]):
+    ...         level = numpyro.sample("level", dist.Normal(0.2, 0.2))
+    ...     beta0 = numpyro.sample("beta0", dist.Beta(2.0, 2.0))
+    ...     delta_w = numpyro.sample("delta_w", dist.HalfNormal(0.1))
+    ...     delta_v = numpyro.sample("delta_v", dist.HalfNormal(0.1))
+    ...     drift = level + rise * (1.0 - jnp.exp(-5.0 * awareness[..., 1]))
+    ...     with numpyro.plate("mission", len(awareness)):
+    ...         rates = tb.models.ContactRate(drift, beta0, delta_w, delta_v)
+    ...         numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    The function is called with the inputs that its parameters name: awareness (mission, bound,
+    robot, feature); contact_rate, n_ticks and duration in s (mission, bound, robot); cell (mission,
+    bound, 2), with rows and columns; and bound (mission, bound, 3), with moves, rows and columns.
+    Missions and bounds are padded: there, rates are NaN, indices are -1, and other inputs are 0.
+    Ticks and durations that are not known, as before a mission, are NaN. To plan, the drift of a
+    bound may depend only on awareness, cell and move of this bound. Sample a variable of each
+    mission within the plate of missions.
     """
 
     support = constraints.independent(constraints.real, 2)  # pyright: ignore
@@ -169,7 +187,8 @@ class ContactRate(dist.Distribution):
         def step(belief: kalman.Belief, bound: Any) -> tuple[kalman.Belief, Array]:
             y, u, o = bound
             predicted = kalman.predict(self.space, belief, Inputs(u, o))
-            return kalman.update(self.space, predicted, y, y, kalman.GaussianRates())
+            no_ticks = y  # any array of this shape
+            return kalman.update(self.space, predicted, y, no_ticks, kalman.GaussianRates())
 
         start = jax.tree.map(
             lambda a: jnp.broadcast_to(a.astype(float), (n_missions, *a.shape[1:])),

@@ -205,7 +205,7 @@ def _interpolated(cubics: np.ndarray, score: jax.Array) -> jax.Array:
 
     Args:
         cubics: Coefficients of polynomials (power, interval, score); see `NormalScores.cubics`.
-        score: NormalScores (point, score).
+        score: Normal scores (point, score).
     """
     step = 2.0 * _FARTHEST / (_N_KNOTS - 1)
     interval = jnp.clip(jnp.floor((score + _FARTHEST) / step), 0, _N_KNOTS - 2).astype(int)

@@ -66,7 +66,10 @@ def step(A: Any, state: Any, drift: Any) -> Any:
 def predict(space: StateSpace, belief: Belief, inputs: Inputs) -> Belief:
     """Predict trust after a bound, with inputs (point, group, member).
 
-    m = A m + u,    P = A P A' + Q
+    m = A m + u,    P = A P A' + Q,
+
+    where m is the mean of the state d. A belief is of trust d + o, so the old offset is subtracted
+    and the new one is added.
     """
     A = space.transition
     state = belief.mean - belief.offset
@@ -79,7 +82,7 @@ def predict(space: StateSpace, belief: Belief, inputs: Inputs) -> Belief:
 def update(
     space: StateSpace, predicted: Belief, y: Any, n_ticks: Any, likelihood: MomentMatching
 ) -> tuple[Belief, Any]:
-    """Update trust with rates y (..., group, member), one member at a time.
+    """Update trust with rates y and tick counts (..., group, member), one member at a time.
 
     The likelihood matches the moments of the linear predictor f, which is exact for Gaussian rates.
     The regression of trust on f transfers the change to trust:
@@ -204,7 +207,8 @@ def draw_trust(
     filtered = []
     for of_bound, y in zip(inputs, rates, strict=True):
         predicted.append(predict(space, belief, of_bound))
-        belief, _ = update(space, predicted[-1], y, y, GaussianRates())
+        no_ticks = y  # any array of this shape
+        belief, _ = update(space, predicted[-1], y, no_ticks, GaussianRates())
         filtered.append(belief)
 
     trust = [draw(filtered[-1], rng).mean]
@@ -230,7 +234,10 @@ def gaussian_match(y: Any, mean: Any, var: Any, sd: Any) -> tuple[Any, Any, Any]
 
 
 class GaussianRates:
-    """Likelihood of Gaussian rates in JAX; NaN marks rates that were not measured."""
+    """Likelihood of Gaussian rates in NumPy or JAX, which does not use the tick counts.
+
+    NaN marks rates that were not measured.
+    """
 
     def moment_match(
         self, y: Any, n_ticks: Any, mean: Any, var: Any, sd: Any, /
