@@ -122,7 +122,8 @@ def test_optional_columns_that_differ_only_in_case_are_refused():
 @pytest.mark.parametrize(
     "content", [b"who,t\n7\n", b"who,t\n7,1,2\n", b"who,who\n7,1\n", b"who,t\n",
                 b"PK\x03\xff", b"a\xe9,t\n1,2\n", b'who,t\n7,"1\n8,2\n',
-                b'who,t\n7,"1\n8,2\n9,3"\n', gzip.compress(b"who,t\n7,1\n", mtime=0), b"PK\x03\x04\x14",
+                b'who,t\n7,"1\n8,2\n9,3"\n', gzip.compress(b"who,t\n7,1\n", mtime=0),
+                b"PK\x03\x04\x14",
                 b"\xd0\xcf\x11\xe0", b"PAR1\x15"],
 )  # fmt: skip
 def test_files_that_are_no_table_are_refused(content, tmp_path):
