@@ -45,9 +45,10 @@ class Follower:
         self.running = False
 
         n_robots = self._workspace.team.n_robots
-        draws = campaign.forecast
         if campaign.state.posterior is None:
             draws = campaign.draw_prior(_N_DRAWS)
+        else:
+            draws = campaign.forecast
         start = TrustFilter(
             draws,
             n_robots,

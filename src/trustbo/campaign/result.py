@@ -150,9 +150,8 @@ class Result(Summary):
     @computed
     def belief(self) -> Draws:
         """Parameter draws of the last posterior, or of the prior before anything was learned."""
-        posterior = self.state.posterior
-        if posterior is not None:
-            return self.learner.draws(posterior, self.workspace)
+        if self._drawn is not None:
+            return self._drawn[0]
         if self.state.settings["initial"] == "prior_draw":
             return self.draw_prior(1)
         return self.learner.prior_mean(self.workspace)
@@ -160,10 +159,15 @@ class Result(Summary):
     @computed
     def forecast(self) -> Draws:
         """Draws like `belief`, with effects drawn for the next mission, for bands."""
+        return self.belief if self._drawn is None else self._drawn[1]
+
+    @computed
+    def _drawn(self) -> tuple[Draws, Draws] | None:
+        """The draws of the last posterior, read once for `belief` and `forecast`."""
         posterior = self.state.posterior
         if posterior is None:
-            return self.belief
-        return self.learner.draws(posterior, self.workspace, next_mission=True)
+            return None
+        return self.learner.expected_and_drawn(posterior, self.workspace)
 
     def draw_prior(self, n_draws: int) -> Draws:
         """Draw parameters from the prior, with a leading axis (draw,)."""
