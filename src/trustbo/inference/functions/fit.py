@@ -111,7 +111,7 @@ def fit_function(
     data = _data_for(model, missions, observations)
     sites = model.sites(data)
     if workspace is not None:
-        require_plannable(model, workspace, data)
+        require_plannable(model, workspace)
 
     first = _start(model, sites, data, start, chains, seed)
     samples, verdict = _sampled(
@@ -120,8 +120,7 @@ def fit_function(
     stats = {ours: samples.fields[theirs] for theirs, ours in _STATS.items()}
     stats["lp"] = -stats["lp"]  # NumPyro's potential is -log density
 
-    flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in samples.z.items()}
-    values = model.over_draws("constrain", 1, data)(flat)
+    values = _constrained(model, data, samples)
     by_chain = {name: v.reshape(*stats["lp"].shape, *v.shape[1:]) for name, v in values.items()}
 
     n_missions = len(missions)
@@ -178,16 +177,13 @@ def with_latent_of_function(
     observations = Observations.from_missions(missions)
     data = _data_for(model, missions, observations)
     sites = model.sites(data)
-    values = _padded_values(posterior, sites)
-    n_draws = len(next(iter(values.values())))
     n_chains = posterior["posterior"].sizes["chain"]
+    n_draws = n_chains * posterior["posterior"].sizes["draw"]
     n_missions = len(missions)
     seed = posterior.attrs["seed"]
 
     kept, some = kept_draws(posterior)
     rng = stream(seed, "latent of a function")
-    evaluate = model.over_draws("evaluate", 2, data)
-    keys = _keys(n_draws, seed)
 
     shape = observations.contact_rate.shape
     mean = np.zeros(shape)
@@ -198,9 +194,7 @@ def with_latent_of_function(
     trust = np.empty((len(some), *shape))
     predicted = np.empty((len(some), *shape))
     with slow_bar("latent trust", " draws", progress, total=n_draws) as bar:
-        for begin in range(0, n_draws, _SIZE):
-            where = slice(begin, begin + _SIZE)
-            found: Found = evaluate({n: v[where] for n, v in values.items()}, keys[where])
+        for where, found in _evaluated(model, posterior, data, np.arange(n_draws)):
             of_counts = bool(found.of_counts.all())
             log_likelihood[where] = found.log_likelihood[:, :n_missions]
             for name, of_site in found.log_prior.items():
@@ -213,6 +207,7 @@ def with_latent_of_function(
             mean += x.sum(0) / n_draws
             square += (x**2).sum(0) / n_draws
 
+            begin = where[0]
             first, last = np.searchsorted(some, (begin, begin + len(x)))
             trust[first:last] = x[some[first:last] - begin]
             predicted[first:last] = rates[some[first:last] - begin]
@@ -254,16 +249,12 @@ def log_likelihood_of_function(
     """
     observations = Observations.from_missions(missions)
     data = _data_for(model, missions, observations)
-    values = _padded_values(posterior, model.sites(data))
-    n_draws = len(next(iter(values.values())))
-    evaluate = model.over_draws("evaluate", 2, data)
-    keys = _keys(n_draws, posterior.attrs["seed"])
+    sizes = posterior["posterior"].sizes
+    n_draws = sizes["chain"] * sizes["draw"]
 
     of_counts = True
     log_likelihood = np.empty((n_draws, len(missions)))
-    for begin in range(0, n_draws, _SIZE):
-        where = slice(begin, begin + _SIZE)
-        found: Found = evaluate({name: v[where] for name, v in values.items()}, keys[where])
+    for where, found in _evaluated(model, posterior, data, np.arange(n_draws)):
         of_counts = bool(found.of_counts.all())
         log_likelihood[where] = found.log_likelihood[:, : len(missions)]
     return log_likelihood, of_counts and _all_counted(observations)
@@ -280,15 +271,25 @@ def forms_of_function(
     """
     observations = Observations.from_missions(missions)
     data = _data_for(model, missions, observations)
+    n_missions, n_bounds = observations.contact_rate.shape[:2]
+    for _, found in _evaluated(model, posterior, data, some):
+        space, inputs = _form_of(found, n_missions, n_bounds)
+        yield space, inputs, bool(found.of_counts.all()) and _all_counted(observations)
+
+
+def _evaluated(
+    model: FunctionModel, posterior: xr.DataTree, data: Data, some: np.ndarray
+) -> Iterator[tuple[np.ndarray, Found]]:
+    """Run a function with some draws of its posterior; yield chunks of their indices, and results.
+
+    A draw has the same random key whichever other draws are chosen.
+    """
     values = _padded_values(posterior, model.sites(data))
     keys = _keys(len(next(iter(values.values()))), posterior.attrs["seed"])
     evaluate = model.over_draws("evaluate", 2, data)
-    n_missions, n_bounds = observations.contact_rate.shape[:2]
     for begin in range(0, len(some), _SIZE):
         where = some[begin : begin + _SIZE]
-        found: Found = evaluate({name: v[where] for name, v in values.items()}, keys[where])
-        space, inputs = _form_of(found, n_missions, n_bounds)
-        yield space, inputs, bool(found.of_counts.all()) and _all_counted(observations)
+        yield where, evaluate({name: v[where] for name, v in values.items()}, keys[where])
 
 
 def _all_counted(observations: Observations) -> bool:
@@ -357,7 +358,7 @@ def prior_draws_of_function(
     return FunctionDraws(model, values, workspace.team.names, features, (rows, cols))
 
 
-def require_plannable(model: FunctionModel, workspace: Workspace, data: Data | None = None) -> None:
+def require_plannable(model: FunctionModel, workspace: Workspace) -> None:
     """Raise TrustboError if a function cannot plan in a workspace."""
     draws = prior_draws_of_function(model, 2, 0, workspace)
     draws.require_plannable(workspace.awareness.values)
@@ -431,12 +432,17 @@ def _judge(
     return Verdict(found, [], [name for name, failed in alone.items() if failed])
 
 
+def _constrained(model: FunctionModel, data: Data, samples: Samples) -> dict[str, np.ndarray]:
+    """Return the values (draw, ...) of the variables, with chains joined."""
+    flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in samples.z.items()}
+    return model.over_draws("constrain", 1, data)(flat)
+
+
 def _used_by_plans(model: FunctionModel, data: Data, samples: Samples) -> dict[str, np.ndarray]:
     """Return the drift in some measured bounds and the form, each (chain, draw, number)."""
     shape = samples.fields["diverging"].shape
     n_draws = shape[0] * shape[1]
-    flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in samples.z.items()}
-    values = model.over_draws("constrain", 1, data)(flat)
+    values = _constrained(model, data, samples)
     space, inputs = model.over_draws("form", 2, data)(values, _keys(n_draws, 0))
 
     measured = np.flatnonzero(~np.isnan(data[RATES].ravel()))
@@ -497,6 +503,8 @@ def _sampled(
         is_last = attempt == most
         verdict = _judge(model, data, joined, patient=patient, last=is_last)
         if not verdict.complaints or is_last:
+            if not runs:  # the draws of one run are as many as were asked for
+                return joined, verdict
             few = joined.some(draws)
             of_few = _judge(model, data, few, patient=patient)
             return (joined, verdict) if of_few.complaints else (few, of_few)
@@ -574,17 +582,22 @@ def _form_of(found: Found, n_missions: int, n_bounds: int) -> tuple[StateSpace, 
     return StateSpace(*fields), Inputs(*inputs)
 
 
+def _by_mission(inputs: Inputs) -> Iterator[list[Inputs]]:
+    """Yield the inputs (draw, group, member) of each bound, for each mission."""
+    drift = inputs.drift
+    offset = np.broadcast_to(inputs.offset, drift.shape)
+    for j in range(drift.shape[1]):
+        yield [Inputs(drift[:, j, k], offset[:, j, k]) for k in range(drift.shape[2])]
+
+
 def _drawn_trust(
     space: StateSpace, inputs: Inputs, observations: Observations, rng: np.random.Generator
 ) -> np.ndarray:
     """Draw trust (draw, mission, bound, robot) given the rates of all missions."""
-    drift = np.asarray(inputs.drift)
-    n_draws, n_missions, n_bounds, n_groups, n = drift.shape
-    offset = np.broadcast_to(inputs.offset, drift.shape)
-    trust = np.empty((n_draws, n_missions, n_bounds, n_groups * n))
-    for j in range(n_missions):
+    n_draws, _, n_bounds, n_groups, n = inputs.drift.shape
+    trust = np.empty((n_draws, *observations.contact_rate.shape))
+    for j, of_bounds in enumerate(_by_mission(inputs)):
         rates = observations.contact_rate[j].reshape(n_bounds, n_groups, n)
-        of_bounds = [Inputs(drift[:, j, k], offset[:, j, k]) for k in range(n_bounds)]
         drawn = kalman.draw_trust(space, of_bounds, rates, n_groups, rng)
         trust[:, j] = drawn.reshape(n_draws, n_bounds, -1)
     return trust
@@ -594,13 +607,10 @@ def _replicated(
     space: StateSpace, inputs: Inputs, observations: Observations, rng: np.random.Generator
 ) -> np.ndarray:
     """Draw replicated rates (draw, mission, bound, robot)."""
-    drift = np.asarray(inputs.drift)
-    n_draws, n_missions, n_bounds, n_groups, n = drift.shape
-    offset = np.broadcast_to(inputs.offset, drift.shape)
+    n_draws, _, n_bounds, n_groups, n = inputs.drift.shape
     family = FAMILIES["gaussian"]
-    rates = np.empty((n_draws, n_missions, n_bounds, n_groups * n))
-    for j in range(n_missions):
-        of_bounds = [Inputs(drift[:, j, k], offset[:, j, k]) for k in range(n_bounds)]
+    rates = np.empty((n_draws, *observations.contact_rate.shape))
+    for j, of_bounds in enumerate(_by_mission(inputs)):
         ticks = observations.n_ticks[j].reshape(n_bounds, n_groups, n)
         begin = kalman.initial(space, n_groups)
         drawn = kalman.forecast(space, begin, of_bounds, ticks, family, rng)
