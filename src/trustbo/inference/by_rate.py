@@ -26,6 +26,7 @@ from trustbo.inference.loo import LIKELIHOOD_OF, RATES, TICKS
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.observations import Observations
 from trustbo.parallel import computing
+from trustbo.statespace import kalman
 from trustbo.statespace.blocks import Layout, LinearPredictor, each
 from trustbo.streams import stream
 
@@ -279,7 +280,7 @@ def one_step_ahead(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Predict the rate of each row from the earlier rows of its block.
 
-    The linear predictors f of a block are jointly normal, and are updated as in `kalman.update`.
+    The linear predictors f of a block are jointly normal, and are updated by `kalman.condition`.
 
     Args:
         predictors: Distribution of the linear predictors before any rate.
@@ -306,12 +307,8 @@ def one_step_ahead(
         v = cov[..., k, k]
         f = m + np.sqrt(v) * rng.standard_normal(m.shape)
         drawn[..., k] = likelihood.sample(f, sd[..., k], n_ticks[:, k], rng)
-        log_p[..., k], after, left = likelihood.moment_match(
-            y[:, k], n_ticks[:, k], m, v, sd[..., k]
+        mean, cov, log_p[..., k] = kalman.condition(
+            mean, cov, k, y[:, k], n_ticks[:, k], sd[..., k], likelihood
         )
-
-        gain = cov[..., k] / v[..., None]
-        mean = mean + gain * (after - m)[..., None]
-        cov = cov - gain[..., :, None] * gain[..., None, :] * (v - left)[..., None, None]
 
     return log_p, drawn

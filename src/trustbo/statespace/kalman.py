@@ -109,18 +109,30 @@ def update(
         if xp is np and np.isnan(rate).all():
             continue
 
-        k = first + i
-        m = mean[..., k]
-        v = cov[..., k, k]
-        log_mass, m_after, v_after = likelihood.moment_match(
-            rate, n_ticks[..., i], m, v, space.noise_sd[..., i]
+        mean, cov, log_mass = condition(
+            mean, cov, first + i, rate, n_ticks[..., i], space.noise_sd[..., i], likelihood
         )
-        gain = cov[..., k] / v[..., None]
-        mean = mean + gain * (m_after - m)[..., None]
-        cov = cov - gain[..., :, None] * gain[..., None, :] * (v - v_after)[..., None, None]
-        log_density = log_density + xp.broadcast_to(log_mass, m.shape).sum(-1)
+        log_density = log_density + xp.broadcast_to(log_mass, mean.shape[:-1]).sum(-1)
 
     return Belief(mean[..., :n], cov[..., :n, :n], predicted.offset), log_density
+
+
+def condition(
+    mean: Any, cov: Any, k: int, rate: Any, n_ticks: Any, sd: Any, likelihood: MomentMatching
+) -> tuple[Any, Any, Any]:
+    """Condition joint normals (..., n) on a rate, whose linear predictor is their entry k.
+
+    Returns:
+        The mean (..., n) and covariance (..., n, n) given the rate, and its log mass (...,).
+    """
+    m = mean[..., k]
+    v = cov[..., k, k]
+    log_mass, m_after, v_after = likelihood.moment_match(rate, n_ticks, m, v, sd)
+
+    gain = cov[..., k] / v[..., None]
+    mean = mean + gain * (m_after - m)[..., None]
+    cov = cov - gain[..., :, None] * gain[..., None, :] * (v - v_after)[..., None, None]
+    return mean, cov, log_mass
 
 
 def marginal_log_densities(
