@@ -34,6 +34,7 @@ START, GOAL = (7, 0), (0, 7)
 MISSIONS = 8
 LEVEL = 0.01  # significance level of sbc, for all parameters together
 RANKED = 99  # draws among which a true parameter is ranked
+PRINTED = 10  # sets between two lines of progress
 
 
 def saturating(awareness, contact_rate=None):
@@ -217,6 +218,10 @@ def sbc(sets):
             draws = tree["posterior"][name].values.ravel()
             some = draws[np.linspace(0, draws.size - 1, RANKED).astype(int)]
             ranks.setdefault(name, []).append(int((some < float(value[0])).sum()))
+
+        if (seed + 1) % PRINTED == 0:
+            means = ", ".join(f"{name} {np.mean(r) / RANKED:.2f}" for name, r in ranks.items())
+            print(f"  {seed + 1} of {sets}: {refused} bad fits, mean ranks {means}", flush=True)
 
     table = Table("parameter", "p of uniform ranks", "mean rank (expected .5)")
     p = {}
