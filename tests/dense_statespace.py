@@ -156,7 +156,7 @@ def equations_of_params(params, awareness, path=None, *, x0=None):
         params: `TrustParams`, `RobotParams` or `CoupledParams`, whose fields (..., ...) are read.
         awareness: Awareness (bound, robot, feature).
         path: Cells from the start on; needed with effects of places.
-        x0: Trust before the first bound, if it is known.
+        x0: Trust before the first bound, if it is known, shape () or (robot,).
     """
     n_robots = awareness.shape[1]
     u = np.stack(
@@ -167,9 +167,12 @@ def equations_of_params(params, awareness, path=None, *, x0=None):
         u = u + of_places(params, path)
 
     own = np.eye(n_robots)
-    x0_mean, x0_sd = (params.x0_mean, params.x0_sd) if x0 is None else (x0, 0.0)
-    m0 = np.asarray(x0_mean)[..., None] * np.ones(n_robots)
-    P0 = np.asarray(x0_sd)[..., None, None] ** 2 * own
+    if x0 is None:
+        m0 = np.asarray(params.x0_mean)[..., None] * np.ones(n_robots)
+        P0 = np.asarray(params.x0_sd)[..., None, None] ** 2 * own
+    else:
+        m0 = np.asarray(x0) * np.ones(n_robots)
+        P0 = 0.0 * own
     if hasattr(params, "B0"):
         form = Form(params.B0, params.Delta_w, m0, P0, params.Delta_v)
         return form, u, np.zeros_like(u)

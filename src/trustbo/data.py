@@ -38,7 +38,7 @@ class Bound:
             a log without a map; NaN where not measured.
         contact_rate: Fraction of time in contact, shape (robot,); NaN where not measured.
         duration: Running time of the bound, shape (robot,), s; NaN where not recorded.
-        status: Outcome of the bound, `"ok"` or the reason that ended the mission.
+        status: Outcome of the bound, `"ok"` or the reason why the lead did not complete it.
         t0: Start of the bound, s since the mission's start.
         poses: Shape (tick, 1 + robot, 3), the lead first: x and y in CRS metres, heading in rad
             from east, anticlockwise. None where not recorded.
@@ -109,7 +109,9 @@ class Mission(Summary):
     Attributes:
         path: Planned cells, start first, each (row, col); empty in a log without a map.
         bounds: Bounds that were run; bound k enters `path[k]`. If the mission ended early, there
-            are fewer bounds than planned, and the last one has the status of the mission.
+            are fewer bounds than planned, and the last one has the status of the mission. If it
+            continued after a bound that failed, the next bound starts in the cell of this bound; a
+            lead that did not stay there has first driven a bound back to the cell before.
         status: `"ok"` if the mission reached the goal, else the reason why it did not.
         features: Names of the features, in the order of the last axis of `awareness`.
         robots: Names of the overwatching robots.
@@ -196,7 +198,7 @@ class Mission(Summary):
         awareness: ArrayLike,
         contact_rate: ArrayLike,
         duration: ArrayLike | None = None,
-        status: str = "ok",
+        status: str | Sequence[str] = "ok",
         *,
         n_ticks: ArrayLike | None = None,
         features: Sequence[str] = (),
@@ -219,7 +221,8 @@ class Mission(Summary):
             contact_rate: Shape (bound, robot), in [0, 1].
             duration: Shape (bound, robot) or (bound,), s, or one number for each robot by name;
                 None where not recorded.
-            status: Outcome of the mission.
+            status: Outcome of the mission, or the outcome of each bound if the mission continued
+                after a bound that failed.
             n_ticks: Number of ticks over which `contact_rate` is averaged, shape (bound, robot) or
                 (bound,); None where not recorded.
             features: Names of the features; by default those of the labels, or traversability,
@@ -250,6 +253,12 @@ class Mission(Summary):
                 "Give None for a log without a map."
             )
 
+        statuses = [*["ok"] * (len(y) - 1), status] if isinstance(status, str) else [*status]
+        if len(statuses) != len(y):
+            raise TrustboError(
+                f"status must be one text or {len(y)}, one for each bound; got {len(statuses)}."
+            )
+
         ends = np.cumsum(np.nan_to_num(seconds).max(axis=1)).tolist()
         starts = [0.0, *ends]
         bounds = []
@@ -259,13 +268,13 @@ class Mission(Summary):
                 awareness=z[k],
                 contact_rate=y[k],
                 duration=seconds[k],
-                status=status if k == len(y) - 1 else "ok",
+                status=statuses[k],
                 t0=starts[k],
                 n_ticks=ticks[k],
             )
             bounds.append(bound)
 
-        return cls(cells, tuple(bounds), status, names["feature"], names["robot"])
+        return cls(cells, tuple(bounds), statuses[-1], names["feature"], names["robot"])
 
     def with_awareness(self, awareness: np.ndarray) -> Self:
         """Return the mission with another awareness, shape (bound, robot, feature)."""

@@ -179,6 +179,18 @@ def require_pair(what: str, value: object) -> tuple[int, int]:
     return first, second
 
 
+def require_bounds(what: str, value: object) -> tuple[tuple[tuple[int, int], ...], ...]:
+    """Return bounds as pairs of cells, that left and that entered; raises TrustboError if none."""
+    remedy = "give pairs of neighbouring cells, such as [((2, 1), (1, 1))]"
+    pairs = []
+    for k, bound in enumerate(require_list(what, value, remedy=remedy)):
+        cells = require_cells(f"{what}[{k}]", bound)
+        if len(cells) != 2:
+            raise TrustboError(f"{what}[{k}] must be two cells; got {one_line(bound)}.")
+        pairs.append(cells)
+    return tuple(pairs)
+
+
 class Renamed:
     """Decorator for a function or class whose arguments got new names.
 

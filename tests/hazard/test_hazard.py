@@ -273,6 +273,28 @@ def test_missions_count_as_exposures_up_to_where_they_end():
     assert counted.lost[0].tolist() == [0, 1, 2]
 
 
+def test_each_bound_that_failed_counts_and_the_way_back_does_not():
+    a, b, c, d = (0, 0), (0, 1), (0, 2), (1, 1)
+    path = (a, b, c, b, d, c)
+    ends = "ok", "stuck", "ok", "aborted", "ok"
+    n_bounds = len(ends)
+    z = np.full((n_bounds, 1, 1), 0.5)
+    rates = np.full((n_bounds, 1), 0.5)
+    counted = Trials.from_missions([tb.Mission.from_arrays(path, z, rates, status=ends)])
+    east, north_east = 4, 2
+    assert counted.bounds.tolist() == [[north_east, *c], [east, *b], [east, *c]]
+    assert counted.n.tolist() == [1, 1, 1]
+    assert counted.failed.tolist() == [0, 0, 1]
+
+    ends = "ok", "stuck", "tipped"  # on the way back
+    stuck = tb.Mission.from_arrays(path, z[:3], rates[:3], status=ends)
+    counted = Trials.from_missions([stuck])
+    west = 3
+    assert counted.bounds.tolist() == [[west, *b], [east, *b], [east, *c]]
+    assert counted.n.tolist() == [1, 1, 1]
+    assert counted.failed.tolist() == [1, 0, 1]
+
+
 def test_a_failed_bound_has_a_higher_risk_and_a_completed_one_a_lower():
     ws = workspace()
     group = fit_hazard([mission(ROW, "stuck", 2)] * 3, ws)

@@ -85,6 +85,13 @@ def test_a_logger_may_write_the_status_ok_for_the_start():
         read_table(rows(status=["stuck", "ok", "ok"]))
 
 
+def test_a_mission_may_go_on_after_a_bound_that_failed():
+    table = rows(status=["", "stuck", "ok"])
+    (one,) = read_table(table)
+    assert ([bound.status for bound in one.bounds], one.status) == (["stuck", "ok"], "ok")
+    pd.testing.assert_series_equal(to_frame([one])["status"].iloc[1:], table["status"].iloc[1:])
+
+
 @pytest.mark.parametrize(
     "columns",
     [
@@ -104,7 +111,6 @@ def test_a_logger_may_write_the_status_ok_for_the_start():
         {"duration": [None, "inf", 4.0]},
         {"duration": [None, 0.0, 4.0]},
         {"status": ["", "ok", "fine"]},
-        {"status": ["", "stuck", "ok"]},
         {"n_ticks": [None, 3, 4]},
         {"mission": [1, None, 1]},
         {"robot": ["r1", "r1", "r2"]},

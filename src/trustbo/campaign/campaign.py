@@ -9,9 +9,17 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.folder import FolderStorage
-from trustbo.campaign.learning import as_learned, is_excluded_by_user, learn, why_never_learned
+from trustbo.campaign.learning import (
+    as_learned,
+    informed_planner,
+    is_excluded_by_user,
+    learn,
+    learn_hazard,
+    why_never_learned,
+)
 from trustbo.campaign.read import lock_campaign, read_campaign
 from trustbo.campaign.record import RECORD
+from trustbo.campaign.replan import follow, whole_plan
 from trustbo.campaign.result import Result, in_a_line
 from trustbo.campaign.settings import (
     name_of,
@@ -27,6 +35,7 @@ from trustbo.data import Cell, Mission
 from trustbo.display import compiling, tqdm
 from trustbo.errors import (
     TrustboError,
+    require_bounds,
     require_choice,
     require_kind,
     require_pair,
@@ -35,9 +44,11 @@ from trustbo.errors import (
 )
 from trustbo.files import FilePath, holding_interrupts, interpreting, to_json
 from trustbo.hazard import Hazard
+from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import CAUSES
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.learner import Model, learner_from_record, learner_of
+from trustbo.models.draws import Draws
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.policies import POLICIES, Policy, resolve_policy
 from trustbo.simulation import KinematicSimulator
@@ -276,17 +287,20 @@ class Campaign(Result):
         """Plan the next path with the policy."""
         self.storage.require_open()
         self._catch_up()
-        name = f"policy {self.state.settings['policy']!r}"
-
         rng = np.random.default_rng(self.state.seed_of("policy"))
+        return self._choose(rng, self.belief, self.planner)
+
+    def _choose(self, rng: np.random.Generator, draws: Draws, planner: Planner) -> Plan:
+        """Plan a path with the policy, and check what it returned."""
+        name = f"policy {self.state.settings['policy']!r}"
         try:
-            plan = self.policy(rng, self.belief, self.planner)
-        except InfeasibleError as error:  # `_accept` issues the warning
-            plan = self.planner.evaluate(error.path, self.belief.mean())
+            plan = self.policy(rng, draws, planner)
+        except InfeasibleError as error:  # `_record` issues the warning
+            plan = planner.evaluate(error.path, draws.mean())
 
         require_kind(name, plan, Plan, "a policy must return a trustbo.planning.Plan")
         try:
-            self.planner.require_path(plan.path)
+            planner.require_path(plan.path)
         except TrustboError as error:
             raise TrustboError(f"{name}: {error}") from None
         return plan
@@ -307,23 +321,86 @@ class Campaign(Result):
             self._catch_up()
             return self._accept(self.planner.evaluate(path, self.belief.mean()))
 
+    def replan(
+        self,
+        cell: Location,
+        so_far: Mission | None = None,
+        *,
+        blocked: Sequence[Sequence[Cell]] = (),
+    ) -> Plan:
+        """Plan the rest of the mission in progress; `ask` then returns the new plan.
+
+        The path of the plan consists of the cells so far and the new rest. The policy plans the
+        rest with the trust and the parameters given the contact so far, and with the failure
+        probabilities given the bounds so far. The rest never takes a bound that failed in this
+        mission, in either direction. If a bound failed and the team is in the cell before, the path
+        first leads back from the cell that was not reached. Tell the mission as a whole.
+
+        Args:
+            cell: Cell in which the team is, or a position in it (see `Workspace.locate`).
+            so_far: Bounds that were run, with the status of each, such as `"stuck"`. By default,
+                the team drove the asked path up to `cell`, and no contact was measured.
+            blocked: Pairs of neighbouring cells between which no bound can be driven any more. They
+                remain blocked in this mission.
+
+        Returns:
+            Plan of the whole mission. Trust after a bound so far is that of a `TrustFilter`. The
+            value of `lost_contact` includes the contact lost so far; the other values, `p_arrive`
+            and the limits `max_failure` and `max_bounds="shortest+n"` are those of the rest.
+
+        Raises:
+            TrustboError: The mission does not start where the plan starts or does not end in
+                `cell`, `cell` is the goal, or the plan cannot be recorded. `ask` then returns the
+                same plan as before, as after the next error.
+            NoPathError: The goal cannot be reached any more.
+
+        Example:
+            >>> campaign.replan((2, 1), so_far)  # the team is stuck on its way to (1, 2)
+        """
+        with self._turn:
+            plan = self.ask()
+            self._catch_up()
+            cell = self.workspace.locate(cell, "cell")
+            if so_far is not None:
+                require_kind("so_far", so_far, Mission, "give the bounds so far as a Mission")
+                so_far = self.workspace.in_order(so_far)
+
+            driven = follow(self, plan, cell, so_far, require_bounds("blocked", blocked))
+            n_driven = len(driven.path) - 1
+            base = self._base.from_cell(
+                cell, x0=driven.filter.state.mean, blocked=driven.blocked, n_driven=n_driven
+            )
+            risk = self.risk
+            if so_far is not None:
+                risk = BoundRisk(learn_hazard(self.state, self.workspace, so_far), self.workspace)
+            planner = informed_planner(base, risk)
+
+            rng = np.random.default_rng([self.state.seed_of("policy"), n_driven])
+            draws = driven.filter.resample()
+            rest = self._choose(rng, draws, planner)
+            rest = rest.with_draws(planner.evaluate(rest.path, draws))
+            return self._record(whole_plan(self._base.problem, driven, rest))
+
     def _with_bands(self, plan: Plan) -> Plan:
         """Add the posterior bands to a plan."""
         return plan.with_draws(self.planner.evaluate(plan.path, self.belief))
 
     def _accept(self, plan: Plan) -> Plan:
         """Record a plan, with posterior bands, as the next one to run."""
-        accepted = self._with_bands(plan)
+        return self._record(self._with_bands(plan))
+
+    def _record(self, plan: Plan) -> Plan:
+        """Record a plan as the next one to run, and warn if it is not safe."""
         with self._recorded():
-            self.state.asked = accepted
+            self.state.asked = plan
 
         if plan.infeasible:
             warn(
-                f"the plan arrives with probability {accepted.p_arrive:.3g} only, and max_failure "
-                "does not allow this. Suggest a safer path, or increase max_failure."
+                f"the plan arrives with probability {plan.p_arrive:.3g} only, and max_failure does "
+                "not allow this. Suggest a safer path, or increase max_failure."
             )
-        self._warn_of_risk(accepted)
-        return accepted
+        self._warn_of_risk(plan)
+        return plan
 
     def _warn_of_risk(self, plan: Plan) -> None:
         """Warn, once per campaign, if failure is likely but does not influence the plans."""

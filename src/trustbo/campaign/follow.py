@@ -1,5 +1,6 @@
 """Online estimates of each robot's trust during a mission."""
 
+from collections.abc import Sequence
 from copy import copy
 
 import numpy as np
@@ -7,20 +8,20 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled
 from trustbo.campaign.campaign import Campaign
+from trustbo.campaign.replan import trust_filter
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_finite, require_kind, require_pair
-from trustbo.inference import TrustFilter
 from trustbo.inference.filter import TrustForecast, TrustState
-
-_N_DRAWS = 1000
-"""Draws of the prior, from which trust is estimated before the first posterior."""
+from trustbo.planning import Plan
+from trustbo.workspace.grid import Location
 
 
 class Follower:
     """Follows a mission of a campaign bound by bound and tick by tick.
 
-    Call `begin`, `tick` and `end` for each bound; after the last one, `to_mission` returns the
-    mission for `Campaign.tell`. Times are in seconds, from a single clock. Trust is estimated by a
+    Call `begin`, `tick` and `end` for each bound, and `replan` to plan the rest of the mission
+    again, for example after a bound failed. After the last bound, `to_mission` returns the mission
+    for `Campaign.tell`. Times are in seconds, from a single clock. Trust is estimated by a
     `TrustFilter` with the campaign's last posterior, or with the prior before the first one.
     Awareness is taken from the map.
 
@@ -39,27 +40,20 @@ class Follower:
         """
         require_kind("campaign", campaign, Campaign, "give a trustbo.Campaign")
         self.path: tuple[Cell, ...] = tuple(campaign.ask().path)
+        self._campaign = campaign
         self._workspace = campaign.workspace
         self._goal = self.path[-1]
         self.bounds: tuple[Bound, ...] = ()
         self.running = False
 
-        n_robots = self._workspace.team.n_robots
-        if campaign.state.posterior is None:
-            draws = campaign.draw_prior(_N_DRAWS)
-        else:
-            draws = campaign.forecast
-        start = TrustFilter(
-            draws,
-            n_robots,
-            family=campaign.learner.family,
-            workspace=self._workspace,
-        )
+        self._is_over = False  # whether a bound failed, after which nothing was planned
+        start = trust_filter(campaign)
 
         # `_before` has the bounds that have ended, and `_now` also the bound in progress.
         self._before = self._now = start
         self.trust: TrustState = start.state
         self._started = self._begun = self._last = -np.inf  # times of start and last call
+        n_robots = self._workspace.team.n_robots
         self._counts = np.zeros((2, n_robots))  # ticks with contact; all ticks
 
     @property
@@ -74,12 +68,15 @@ class Follower:
         An unplanned cell discards the rest of the plan; all later bounds then need a `cell`.
 
         Raises:
-            TrustboError: A bound is in progress, the mission is over, no cell is planned, the cell
-                is not a neighbour, or `t` is before the previous time.
+            TrustboError: A bound is in progress, the last bound failed, no cell is planned, the
+                cell is not a neighbour, or `t` is before the previous time.
         """
         self._require(running=False, t=t)
-        if self.bounds and self.bounds[-1].status != "ok":
-            raise TrustboError(f"the mission is over ({self.bounds[-1].status}); call to_mission.")
+        if self._is_over:
+            raise TrustboError(
+                f"the mission is over ({self.bounds[-1].status}); call to_mission, or replan if it "
+                "goes on."
+            )
 
         here, *planned = self.rest
         if cell is None and not planned:
@@ -120,7 +117,7 @@ class Follower:
         self._count(t, counts, (here, cell))
 
     def end(self, t: float, status: str = "ok") -> None:
-        """End the bound in progress; a status other than `"ok"` ends the mission.
+        """End the bound in progress; a status other than `"ok"` ends the mission unless you replan.
 
         Raises:
             TrustboError: No bound is in progress, the status is unknown, the bound has no duration,
@@ -135,8 +132,41 @@ class Follower:
         bound = Bound(self.rest[0], unknown, rates, seconds, status, since, n_ticks=n_ticks)
         self.bounds = (*self.bounds, bound)
         self.running = False
+        self._is_over = status != "ok"
         self._last = t
         self._before = self._now
+
+    def replan(
+        self, cell: Location | None = None, *, blocked: Sequence[Sequence[Cell]] = ()
+    ) -> Plan:
+        """Plan the rest of the mission from the bounds so far, and follow the new plan.
+
+        After a bound that failed, the rest avoids this bound. If the team is in the cell before,
+        the next bound of `path` leads back there, and its ticks count like those of other bounds.
+        If the team is back already, call `begin` and `end` without ticks.
+
+        Args:
+            cell: Cell in which the team is; by default the cell of the last bound or, if this bound
+                failed, the cell before.
+            blocked: Further bounds that cannot be driven; see `Campaign.replan`.
+
+        Returns:
+            Plan of the whole mission, which `Campaign.ask` returns from now on.
+
+        Raises:
+            TrustboError: A bound is in progress, or `Campaign.replan` raises an error. The follower
+                is then as before.
+        """
+        self._require(running=False, t=self._last if self.bounds else 0.0)
+        n = len(self.bounds)
+        if cell is None:
+            cell = self.path[n - 1] if self._is_over else self.path[n]
+
+        so_far = self.to_mission() if n else None
+        plan = self._campaign.replan(cell, so_far, blocked=blocked)
+        self.path = tuple(plan.path)
+        self._is_over = False
+        return plan
 
     def ahead(self) -> TrustForecast:
         """Predict trust and contact rates in the bounds of `rest`, shapes (bound, robot).

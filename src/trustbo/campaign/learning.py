@@ -90,13 +90,16 @@ def _previous(state: State) -> xr.DataTree | None:
         return None
 
 
-def learn_hazard(state: State, workspace: Workspace) -> xr.Dataset:
+def learn_hazard(state: State, workspace: Workspace, so_far: Mission | None = None) -> xr.Dataset:
     """Fit the failure probabilities of bounds to all missions; see `fit_hazard`.
 
     Missions that cannot be used for learning trust are included, since they show where the team
-    failed. If the diagnostics fail, the previous posterior is returned with a warning.
+    failed, and so are the bounds `so_far` of a mission in progress. If the diagnostics fail, the
+    previous posterior is returned with a warning.
     """
     measured = [entry.measured for entry in state.entries if not is_excluded_by_user(entry)]
+    if so_far is not None:
+        measured.append(so_far)
     lost = [LostMission(f.path, f.where) for f in state.failures if f.path]
     prior = Hazard(**state.settings["hazard"])
     try:

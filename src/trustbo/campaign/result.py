@@ -294,8 +294,8 @@ class Result(Summary):
         """Return a table with one row per mission, labelled by its number, from 1.
 
         The columns are `status`, `state` ("told", not used yet; "learned"; "excluded"; "given up",
-        see `Campaign.fail`, without a number), the `reason` for the state or the failure, the cell
-        `where` the mission failed, the mean `contact_rate`, the `objective` of the plan, the number
+        see `Campaign.fail`, without a number), the `reason` for the state or the failure, the cells
+        `where` a bound failed, the mean `contact_rate`, the `objective` of the plan, the number
         `n_bounds` of bounds run, `path_changed` (whether the plan differs from the previous one),
         the planned `path` as text, "9,0 8,1", `contact_lost` in bounds (bounds that were not run
         lose all contact), and the diagnostics of the posterior (see `fit`).

@@ -170,6 +170,9 @@ class State:
         if mission.path[-1] != plan.path[-1]:  # the goal was not in the path any more
             n_planned = max(n_planned, len(plan.path) - 1)
         rates = mission.contact_rate
+        failed = [bound.cell for bound in mission.bounds[:-1] if bound.status != "ok"]
+        if mission.status != "ok":
+            failed.append(mission.bounds[-1].cell)
         contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
 
         return {
@@ -180,7 +183,7 @@ class State:
             "status": mission.status,
             "state": TOLD,
             "reason": "",
-            "where": path_text([mission.bounds[-1].cell]) if mission.status != "ok" else "",
+            "where": path_text(failed),
             "n_bounds": len(mission.bounds),
             "path": path_text(plan.path),
         }

@@ -10,7 +10,7 @@ from trustbo.errors import TrustboError
 from trustbo.workspace.moves import bounds_along
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
-"""Statuses of missions whose last bound failed; aborted missions do not count as failed."""
+"""Statuses of bounds that failed; aborted bounds and missions do not count as failed."""
 
 
 class LostMission(NamedTuple):
@@ -46,17 +46,18 @@ class Trials(NamedTuple):
     def from_missions(cls, missions: Sequence[Mission], lost: Sequence[LostMission] = ()) -> Self:
         """Count the trials in measured missions and in lost missions.
 
-        The last bound of a failed mission counts as a failure. An aborted bound is not counted.
+        The last bound of a failed mission counts as a failure, and so does each earlier bound that
+        failed. An aborted bound is not counted. Neither is a bound back from a bound that was not
+        completed, unless it fails, because only a part of it was driven.
 
         Raises:
             TrustboError: If a path skips cells or does not enter `where`.
         """
         known = [_reported(mission) for mission in missions]
         known += [_located(mission) for mission in lost if mission.where is not None]
-        unknown = [mission.path for mission in lost if mission.where is None]
+        unknown = [bounds_along(mission.path) for mission in lost if mission.where is None]
 
-        every = [path for path, _ in known] + unknown
-        met = [bounds_along(path) for path in every]
+        met = [tried for tried, _ in known] + unknown
         rows = np.concatenate([np.empty((0, 3), int), *met])
         bounds, index = np.unique(rows, axis=0, return_inverse=True)
         paths = np.split(index, np.cumsum([len(part) for part in met])[:-1]) if met else []
@@ -64,23 +65,29 @@ class Trials(NamedTuple):
         n, failed = np.zeros((2, len(bounds)))
         for path, (_, fails) in zip(paths, known, strict=False):
             np.add.at(n, path, 1.0)
-            failed[path[-1:]] += fails
+            np.add.at(failed, path, fails)
         return cls(bounds, n, failed, tuple(paths[len(known) :]))
 
 
-def _reported(mission: Mission) -> tuple[Sequence[Cell], bool]:
-    """Return the path up to the last bound with a known outcome, and whether that bound failed."""
-    n_run = len(mission.bounds)
-    fails = mission.status in CAUSES
-    is_known = fails or mission.status == "ok"  # an aborted bound neither failed nor was passed
-    n_cells = n_run + 1 if is_known else n_run
-    return mission.path[:n_cells], fails
+def _reported(mission: Mission) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bounds with a known outcome, (bound, 3), and whether each one failed."""
+    path = mission.path
+    statuses = [*(bound.status for bound in mission.bounds[:-1]), mission.status]
+
+    fails = np.array([status in CAUSES for status in statuses])
+    is_known = fails.copy()
+    for k, status in enumerate(statuses):
+        goes_back = k > 0 and statuses[k - 1] != "ok" and path[k + 1] == path[k - 1]
+        if status == "ok" and not goes_back:
+            is_known[k] = True
+
+    return bounds_along(path[: len(statuses) + 1])[is_known], fails[is_known]
 
 
-def _located(mission: LostMission) -> tuple[Sequence[Cell], bool]:
-    """Return the path of a lost mission up to `where`, and True because the last bound failed."""
+def _located(mission: LostMission) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bounds of a lost mission up to `where`, and whether each one failed."""
     if mission.where not in mission.path[1:]:
         raise TrustboError(f"where must be a cell that the path enters; got {mission}.")
 
     n = mission.path.index(mission.where, 1)
-    return mission.path[: n + 1], True
+    return bounds_along(mission.path[: n + 1]), np.arange(1, n + 1) == n

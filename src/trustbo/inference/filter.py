@@ -209,6 +209,15 @@ class TrustFilter:
         self.n_bounds += 1
         return self.state
 
+    def resample(self, *, seed: int = 0) -> Draws:
+        """Return equally weighted draws of the parameters, given the bounds so far.
+
+        Args:
+            seed: Seed of the systematic resampling.
+        """
+        rng = np.random.default_rng(require_whole("seed", seed, 0))
+        return self.params.draw(systematic(self.weights, len(self.weights), rng))
+
     @computing()
     def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
         """Predict trust and contact rates along future bounds.

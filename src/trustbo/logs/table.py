@@ -62,7 +62,7 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
                 if 1 <= k <= n_run:
                     bound = mission.bounds[k - 1]
                     row |= {name: getattr(bound, name)[i] for name in RATES}
-                    row["status"] = mission.status if k == n_run else "ok"
+                    row["status"] = mission.status if k == n_run else bound.status
                     row |= dict(zip(mission.features, bound.awareness[i], strict=True))
                 rows.append(row)
 
@@ -76,9 +76,10 @@ def read_table(table: Any) -> list[Mission]:
     The columns are `mission`; `bound` (0 for the start cell, which has no measurements); `robot`;
     the cell (`row`, `col`); and `contact_rate`. Optional columns are `duration` (s), `n_ticks` and
     `status`. Other columns are features, by default `traversability` and `visibility` without any
-    value. The status of the last bound is that of the mission. A blank means "not measured", and a
-    blank status "ok". Bounds after the last one with a measurement were planned but not run. A
-    table without `row` and `col` is a log without a map. If rates have been rounded, each one is
+    value. The status of the last bound is that of the mission; an earlier bound has another status
+    than "ok" if the mission continued after it failed. A blank means "not measured", and a blank
+    status "ok". Bounds after the last one with a measurement were planned but not run. A table
+    without `row` and `col` is a log without a map. If rates have been rounded, each one is
     read as the nearest multiple of 1 / n_ticks within half a unit of the column's last decimal.
 
     Args:
@@ -192,9 +193,14 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
         )
 
     n_run = int(measured.max())
-    ended = rows.loc[~status.isin(["", "ok"])]
-    if ended["status"].nunique() > 1 or (ended["bound"] < n_run).any():
-        raise TrustboError("only the last bound that was run may have a status other than ok.")
+    statuses = ["ok"] * n_run
+    failed = rows.loc[~status.isin(["", "ok"])]
+    if (failed["bound"] < 1).any():
+        raise TrustboError("the start cell, bound 0, must not have a status other than ok.")
+    for k, of_bound in failed.groupby("bound")["status"]:
+        if of_bound.nunique() > 1:
+            raise TrustboError(f"bound {k} has the statuses {sorted(of_bound.unique())}; give one.")
+        statuses[int(k) - 1] = of_bound.iloc[0]  # pyright: ignore[reportArgumentType]
 
     expected = pd.MultiIndex.from_product([range(1, n_run + 1), robots])
     missing = expected.difference(values.index)
@@ -210,7 +216,7 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
         arrays[..., len(RATES) :],
         rate,
         duration,
-        status=ended["status"].iloc[0] if len(ended) else "ok",
+        status=statuses,
         n_ticks=n_ticks,
         features=features,
         robots=robots,

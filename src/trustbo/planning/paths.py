@@ -46,6 +46,7 @@ class AdmissiblePaths:
         max_bounds: Limit on the number of bounds (see `Planner`).
         turns: Whether U-turns are allowed; True if `max_bounds` is a number.
         avoided: Mask (move, row, col) of the bounds that paths must avoid, or None.
+        blocked: Mask of the bounds that nobody can drive, or None; `avoiding` never allows these.
         bounds: Mask (move, row, col) of bounds that a path may take, indexed by the cell entered.
         bounds_to_goal: Fewest bounds from each cell to the goal, (row, col); -1 if unreachable.
         shortest: Smallest number of bounds of a path.
@@ -59,6 +60,7 @@ class AdmissiblePaths:
         goal: Location,
         max_bounds: int | str = "shortest+2",
         avoided: np.ndarray | None = None,
+        blocked: np.ndarray | None = None,
     ) -> None:
         """Check the arguments and find the shortest path; see `Planner` for the errors."""
         self.workspace = require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
@@ -68,9 +70,11 @@ class AdmissiblePaths:
             raise TrustboError(f"start and goal are both the cell {self.start}; choose two cells.")
 
         self.avoided = avoided
+        self.blocked = blocked
         self.bounds = workspace.passable_bounds.values
-        if avoided is not None:
-            self.bounds = self.bounds & ~avoided
+        for closed in (avoided, blocked):
+            if closed is not None:
+                self.bounds = self.bounds & ~closed
 
         self.bounds_to_goal = fewest_bounds(self.bounds, self.goal, back=True)
         self.shortest = int(self.bounds_to_goal[self.start])
@@ -110,6 +114,9 @@ class AdmissiblePaths:
 
     def _remedy(self) -> str:
         """Return what to do if no path leads to the goal, as a sentence."""
+        if self.blocked is not None:
+            return f"{int(self.blocked.sum())} bounds are blocked."
+
         posts = self.workspace.posts
         terrain = self.workspace.terrain
         if posts is not None and terrain is not None:
@@ -195,7 +202,12 @@ class AdmissiblePaths:
                 avoided[*allowed] = False
             try:
                 return AdmissiblePaths(
-                    self.workspace, self.start, self.goal, self.max_bounds, avoided.copy()
+                    self.workspace,
+                    self.start,
+                    self.goal,
+                    self.max_bounds,
+                    avoided.copy(),
+                    self.blocked,
                 )
             except TrustboError:  # the goal cannot be reached within max_bounds
                 continue
@@ -205,7 +217,9 @@ class AdmissiblePaths:
     def to(self, cell: Cell, extra: int) -> "AdmissiblePaths":
         """Return the paths from the start to another cell, with up to `extra` additional bounds."""
         admitted = f"shortest+{extra}"
-        return AdmissiblePaths(self.workspace, self.start, cell, admitted, self.avoided)
+        return AdmissiblePaths(
+            self.workspace, self.start, cell, admitted, self.avoided, self.blocked
+        )
 
     def cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
         """Convert flat indices to cells; negative indices are padding and are dropped."""
@@ -225,13 +239,17 @@ class AdmissiblePaths:
                 f"a path must lead from {self.start} to {self.goal}; got {one_line(list(cells))}."
             )
 
+        drivable = self.workspace.passable_bounds.values
+        if self.blocked is not None:
+            drivable = drivable & ~self.blocked
+
         entered = np.array(cells[1:]).T
-        broken = ~self.workspace.passable_bounds.values[moves_along(cells), *entered]
+        broken = ~drivable[moves_along(cells), *entered]
         if broken.any():
             k = int(np.argmax(broken))
             raise TrustboError(
-                f"no bound leads from {cells[k]} to {cells[k + 1]}: a cell is impassable, or no "
-                "route connects the cells. Give another path."
+                f"no bound leads from {cells[k]} to {cells[k + 1]}: a cell is impassable, no "
+                "route connects the cells, or the bound is blocked. Give another path."
             )
 
         return cells

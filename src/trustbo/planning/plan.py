@@ -41,6 +41,8 @@ class Plan(Summary):
         risk: Failure probability of each bound, and the arrival probability with its 90 % band;
             None if the planner has no risk.
         infeasible: Whether the failure probability of the path exceeds `max_failure`.
+        blocked: Pairs of cells between which no bound can be driven in this mission; see
+            `Campaign.replan`.
         value_band: Ends of the 90 % band of the value over the draws, with the mean failure
             probability; None with one draw. `value` limits trust to 1 and may lie outside.
     """
@@ -60,6 +62,7 @@ class Plan(Summary):
     risk: PathRisk | None = None
     infeasible: bool = False
     value_band: tuple[float, float] | None = None
+    blocked: tuple[tuple[Cell, ...], ...] = ()
 
     def with_draws(self, given: Self) -> Self:
         """Return this plan with the bands of `given`, a plan for the same path and many draws."""
@@ -153,5 +156,6 @@ def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
     if record["risk"]:
         values["risk"] = PathRisk.from_record(record["risk"])
 
+    values["blocked"] = tuple(((a, b), (c, d)) for (a, b), (c, d) in record.get("blocked", ()))
     values["path"] = tuple((row, col) for row, col in record["path"])
     return Plan(**values)

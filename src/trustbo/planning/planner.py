@@ -14,7 +14,13 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import Renamed, TrustboError, require_choice, require_positive
+from trustbo.errors import (
+    Renamed,
+    TrustboError,
+    require_bounds,
+    require_choice,
+    require_positive,
+)
 from trustbo.hazard.components import Components
 from trustbo.hazard.risk import Risk
 from trustbo.models.draws import Draws
@@ -39,7 +45,7 @@ from trustbo.planning.robot_trust import robot_maps, robot_trust
 from trustbo.planning.trust_map import cost_of, trust_map
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import MOVE_NAMES, along, bounds_along
+from trustbo.workspace.moves import MOVE_NAMES, along, bounds_along, require_on_grid
 
 _DIMS = ("move", "row", "col")
 _MOVE_LABELS = {"move": MOVE_NAMES}
@@ -142,6 +148,51 @@ class Planner(Summary):
         other = copy(self)
         other.problem = replace(self.problem, **changes)
         return other
+
+    def from_cell(
+        self,
+        cell: Location,
+        *,
+        x0: ArrayLike | None = None,
+        blocked: Sequence[Sequence[Cell]] = (),
+        n_driven: int = 0,
+    ) -> Self:
+        """Return a planner of the rest of a mission, from the cell in which the team is.
+
+        The limits `max_failure` and, if it is a text, `max_bounds` apply to the rest alone. A risk
+        is kept, but bounds that are `avoiding` are not.
+
+        Args:
+            cell: Cell in which the lead is, or a position in it.
+            x0: Expected trust in this cell, shape () or (robot,), such as `Follower.trust.mean`; by
+                default `x0_mean` of the parameters.
+            blocked: Pairs of neighbouring cells. No path takes a bound between them, in either
+                direction.
+            n_driven: Number of bounds that were driven so far; if `max_bounds` is a number, it is
+                reduced by it, but never below the fewest bounds that lead to the goal.
+
+        Raises:
+            TrustboError: If the cell is impassable or the goal, or a pair has no neighbours.
+            NoPathError: If the goal cannot be reached.
+
+        Example:
+            >>> rest = planner.from_cell((5, 4), x0=follower.trust.mean).plan(posterior)
+        """
+        paths = self.problem.paths
+        closed = None
+        pairs = require_bounds("blocked", blocked)
+        if pairs:
+            closed = np.zeros(paths.workspace.passable_bounds.shape, bool)
+            for a, b in pairs:
+                there_and_back = require_on_grid([a, b, a], closed.shape[1:])
+                closed[*bounds_along(there_and_back).T] = True
+
+        max_bounds = paths.max_bounds
+        if not isinstance(max_bounds, str):
+            rest = AdmissiblePaths(paths.workspace, cell, self.goal, "shortest", blocked=closed)
+            max_bounds = max(max_bounds - n_driven, rest.shortest)
+        rest = AdmissiblePaths(paths.workspace, cell, self.goal, max_bounds, blocked=closed)
+        return self._with(paths=rest, x0=self.problem.start(x0))
 
     def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
         """Check that a path leads from start to goal and return it as a tuple of cells."""

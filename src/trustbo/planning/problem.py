@@ -55,6 +55,8 @@ class Problem:
         max_failure: Largest failure probability allowed for a path, or None for no limit.
         failure_cost: Cost of a failure in bounds; None for the smallest number of bounds of a path.
         risk: Failure probability of each bound, or None if the planner has no risk.
+        x0: Expected trust at the start, shape (robot,), instead of `x0_mean` of the parameters, or
+            None.
     """
 
     paths: AdmissiblePaths
@@ -64,6 +66,7 @@ class Problem:
     max_failure: float | None = None
     failure_cost: float | None = None
     risk: Risk | None = None
+    x0: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.max_failure is not None:
@@ -166,7 +169,7 @@ class Problem:
     def start(self, x0: ArrayLike | None) -> np.ndarray | None:
         """Read expected trust at the start, shape () or (..., robot), by the robots' names."""
         if x0 is None:
-            return None
+            return self.x0
 
         dims = ("draw", "robot") if "draw" in getattr(x0, "dims", ()) else ("robot",)
         robots = {"robot": self.paths.workspace.team.names}

@@ -1,0 +1,185 @@
+"""Replanning of a mission in progress: the bounds so far, and the plan of the whole mission."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from trustbo.campaign.learning import as_learned
+from trustbo.campaign.result import Result
+from trustbo.data import Cell, Mission, path_text
+from trustbo.errors import TrustboError
+from trustbo.hazard.risk import PathRisk
+from trustbo.hazard.trials import CAUSES
+from trustbo.inference import TrustFilter
+from trustbo.planning import Plan
+from trustbo.planning.plan import QUANTILES
+from trustbo.planning.problem import Problem
+
+Pair = tuple[Cell, ...]
+"""Cell left and cell entered."""
+_N_DRAWS = 1000
+"""Draws of the prior, from which trust is estimated before the first posterior."""
+
+
+class Driven(NamedTuple):
+    """Bounds of a mission in progress.
+
+    Attributes:
+        path: Cells so far, from the start to the cell in which the team is now.
+        contact_rate: Contact rates, shape (bound, robot); NaN where not measured.
+        trust: Trust after each bound given the rates up to it, shape (bound, robot).
+        bands: Quantiles of this trust at the levels `QUANTILES`, shape (quantile, bound, robot).
+        blocked: Pairs of cells between which a bound failed or is blocked.
+        filter: Trust and parameters after the last bound.
+    """
+
+    path: tuple[Cell, ...]
+    contact_rate: np.ndarray
+    trust: np.ndarray
+    bands: np.ndarray
+    blocked: tuple[Pair, ...]
+    filter: TrustFilter
+
+
+def trust_filter(result: Result) -> TrustFilter:
+    """Make the filter of a campaign's next mission, from its last posterior or from its prior."""
+    if result.state.posterior is None:
+        draws = result.draw_prior(_N_DRAWS)
+    else:
+        draws = result.forecast
+    return TrustFilter(
+        draws,
+        result.workspace.team.n_robots,
+        family=result.learner.family,
+        workspace=result.workspace,
+    )
+
+
+def follow(
+    result: Result, plan: Plan, cell: Cell, so_far: Mission | None, blocked: Sequence[Pair]
+) -> Driven:
+    """Follow the bounds of a mission so far; see `Campaign.replan` for the arguments and errors."""
+    workspace = result.workspace
+    closed = [*plan.blocked, *blocked]
+    if so_far is None:
+        path = _planned(plan.path, cell)
+        n_robots = workspace.team.n_robots
+        rates = np.full((len(path) - 1, n_robots), np.nan)
+        n_ticks = rates
+        z = workspace.along(path, anywhere=True)
+    else:
+        path = so_far.path[: len(so_far.bounds) + 1]
+        if path[0] != plan.path[0]:
+            raise TrustboError(
+                f"the mission starts in cell {path[0]}; it must start in {plan.path[0]}."
+            )
+
+        rates = so_far.contact_rate
+        n_ticks = so_far.n_ticks
+        z = as_learned(so_far, workspace).awareness
+        closed += failed_bounds(so_far)
+
+        if cell != path[-1]:
+            path = _returned(path, cell, so_far)
+            z = np.concatenate([z, workspace.along(path[-2:], anywhere=True)])
+            rates = np.pad(rates, ((0, 1), (0, 0)), constant_values=np.nan)
+            n_ticks = np.pad(n_ticks, ((0, 1), (0, 0)), constant_values=np.nan)
+
+    trust = trust_filter(result)
+    means = [np.empty((0, *trust.state.mean.shape))]
+    sds = list(means)
+    for k, bound in enumerate(pairwise(path)):
+        state = trust.update(z[k], rates[k], bound, n_ticks=n_ticks[k])
+        means.append(state.mean[None])
+        sds.append(state.sd[None])
+
+    mean = np.concatenate(means)
+    steps = stats.norm.ppf(QUANTILES)[:, None, None]
+    bands = mean + steps * np.concatenate(sds)
+    return Driven(path, rates, mean, bands, tuple(dict.fromkeys(closed)), trust)
+
+
+def _planned(path: tuple[Cell, ...], cell: Cell) -> tuple[Cell, ...]:
+    """Return the planned path up to a cell."""
+    if path.count(cell) != 1:
+        often = "does not enter" if cell not in path else "enters more than once"
+        raise TrustboError(
+            f"the plan {path_text(path)} {often} the cell {cell}; pass the bounds so far as a "
+            "mission."
+        )
+    return path[: path.index(cell) + 1]
+
+
+def _returned(path: tuple[Cell, ...], cell: Cell, so_far: Mission) -> tuple[Cell, ...]:
+    """Return the path so far, with a bound back from the cell that the team did not reach."""
+    # If a mission stops after a bound that was completed, only the mission has another status.
+    is_completed = so_far.bounds[-1].status == "ok" and so_far.status not in CAUSES
+    possible = path[-1:] if is_completed else path[-2:]
+    if cell not in possible:
+        places = " or ".join(map(str, possible))
+        raise TrustboError(f"after the bounds so far, the team is in {places}, not in {cell}.")
+    return *path, cell
+
+
+def failed_bounds(mission: Mission) -> list[Pair]:
+    """Return the cells left and entered of each bound that failed."""
+    statuses = [*(bound.status for bound in mission.bounds[:-1]), mission.status]
+    bounds = zip(pairwise(mission.path), statuses, strict=False)
+    return [bound for bound, status in bounds if status in CAUSES]
+
+
+def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:
+    """Put the bounds so far before a plan of the rest.
+
+    For an objective that measures contact, the contact lost so far is subtracted from the value.
+    Other objectives have the value of the rest. The failure probability of past bounds is 0.
+
+    Args:
+        problem: Planning problem of the campaign.
+        driven: Bounds so far.
+        rest: Plan from the last cell of `driven` to the goal.
+    """
+    path = (*driven.path, *rest.path[1:])
+    n_driven = len(driven.path) - 1
+
+    risk = rest.risk
+    if risk is not None:
+        p_fail = np.concatenate([np.zeros(n_driven), risk.p_fail])
+        risk = PathRisk(p_fail, risk.p_arrive, risk.p_arrive_band)
+
+    lost = 0.0
+    if problem.objective.of_contact and n_driven:
+        lost = _contact_lost(problem, driven) + problem.bound_cost_along(driven.path)
+    band = rest.value_band
+    if band is not None:
+        band = band[0] - lost, band[1] - lost
+
+    grid = rest.workspace.grid
+    rows, cols = np.array(path).T
+    positions = np.stack([grid.x[cols], grid.y[rows]], axis=1)
+    return replace(
+        rest,
+        path=path,
+        positions=positions,
+        length=float(np.hypot(*np.diff(positions, axis=0).T).sum()),
+        trust=np.concatenate([driven.trust, rest.trust]),
+        bands=np.concatenate([driven.bands, rest.bands], axis=1),
+        value=rest.value - lost,
+        limit=rest.limit - lost,
+        value_band=band,
+        revisits=len(path) - len(set(path)),
+        risk=risk,
+        blocked=driven.blocked,
+    )
+
+
+def _contact_lost(problem: Problem, driven: Driven) -> float:
+    """Compute the contact lost so far, in bounds; expected contact is used where none is known."""
+    noise_sd = driven.filter.space.rate_sd.mean()
+    expected = problem.likelihood.mean_rate(driven.trust, noise_sd)
+    rates = np.where(np.isnan(driven.contact_rate), expected, driven.contact_rate)
+    return float((1.0 - rates).mean(1).sum())
