@@ -124,6 +124,7 @@ def operations(campaign, mission):
         "fail": lambda: campaign.fail("stuck", where=campaign.ask().path[1]),
         "exclude": lambda: campaign.exclude(1, "the lidar was covered"),
         "suggest": lambda: campaign.suggest(OTHER),
+        "replan": lambda: campaign.replan((2, 0), blocked=[campaign.ask().path[:2]]),
         "ask": ask,
     }
 
@@ -191,7 +192,7 @@ def check(folder, operate, mission, expected, fault):
 def expected(template, mission, tmp_path_factory):
     """Each operation on a copy of the campaign, without a fault."""
     results = {}
-    for name in ("tell", "fail", "exclude", "suggest", "ask"):
+    for name in ("tell", "fail", "exclude", "suggest", "replan", "ask"):
         copy = shutil.copytree(template, tmp_path_factory.mktemp("expected") / name)
         with tb.Campaign.load(copy) as campaign:
             operations(campaign, mission)[name]()
@@ -201,7 +202,7 @@ def expected(template, mission, tmp_path_factory):
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("operate", ["tell", "fail", "exclude", "suggest", "ask"])
+@pytest.mark.parametrize("operate", ["tell", "fail", "exclude", "suggest", "replan", "ask"])
 @pytest.mark.slow
 def test_operation_that_fails_at_any_call_is_recorded_or_not(
     template, mission, expected, tmp_path, operate, fault
@@ -294,7 +295,7 @@ def full(disk, n_bytes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("operate", ["tell", "fail", "exclude", "suggest", "ask"])
+@pytest.mark.parametrize("operate", ["tell", "fail", "exclude", "suggest", "replan", "ask"])
 def test_operation_on_a_full_disk_is_recorded_or_not(
     template, mission, expected, small_disk, operate
 ):
