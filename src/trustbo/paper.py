@@ -3,18 +3,42 @@
     >>> workspace = tb.Workspace.from_terrain(terrain, **tb.paper.WORKSPACE)
     >>> result = tb.iterate(workspace, start, goal, **tb.paper.CAMPAIGN)
 
-The model, the objective, the policy, the first path and the sampler follow the paper. There are two
-differences: trustbo chooses the prior of trust before the first bound, which the paper does not
-specify, and integrates latent trust out, which leaves the posterior unchanged.
+The model, the objective, the policy, the first path and the sampler follow the paper. The list
+contains all known differences; the documentation gives the reasons.
+
+Model:
+
+- Priors: the paper does not state them. Here they are `Priors.for_cells()`, and trust before the
+  first bound is N(0.5, 0.5^2).
+- Latent trust is integrated out, which leaves the posterior unchanged.
+- The memory beta0 is in (0, 1); in the paper, it is any real number.
+- The variance of a contact rate includes the resolution of the rate, and not only delta_v^2.
+
+Data:
+
+- Learning uses the awareness of the map. In the paper, robots measure awareness in every bound.
+- Each feature is a principal component as in the paper, but of clipped pixel features, and its sign
+  is declared instead of left to the solver.
+- In phase 1 of a bound, contact is that of the robots' lidars; in phase 2, that of the lead's lidar.
+- The lead stops where it is seen best in the central part of the next cell, not at the centre.
+- Campaigns start from the prior and learn from all of their missions at once. In the paper, the
+  posterior of a given terrain is the prior on the mission terrain.
+
+Planning:
+
+- Trust x in the cost (6) is the mean over the robots; in the paper, it is trust in one robot r_i.
+- Paths have at most two bounds more than the shortest path, and no U-turns. The paper allows all
+  paths.
+- Bounds that failed twice are avoided. In the paper, a failure only ends the mission.
 """
 
 from collections.abc import Mapping
 from typing import Any
 
-from trustbo.models import PooledTrust
+from trustbo.models import PooledTrust, Priors
 from trustbo.terrain import PAPER_VISIBILITY, TRAVERSABILITY
 
-__all__ = ["CAMPAIGN", "WORKSPACE"]
+__all__ = ["CAMPAIGN", "MEAN_TRUST", "WORKSPACE"]
 
 WORKSPACE: Mapping[str, Any] = {
     "features": {"traversability": TRAVERSABILITY, "visibility": PAPER_VISIBILITY},
@@ -24,7 +48,7 @@ WORKSPACE: Mapping[str, Any] = {
 Its two features are composites, each the first principal component of several pixel features."""
 
 CAMPAIGN: Mapping[str, Any] = {
-    "model": PooledTrust(),
+    "model": PooledTrust(Priors.for_cells()),
     "policy": "greedy",
     "objective": "terminal",
     "initial": "prior_draw",
@@ -34,3 +58,8 @@ CAMPAIGN: Mapping[str, Any] = {
 of parameters for all robots and no effects; NUTS samples its posterior (5). Each path minimises the
 cost (6), 1 - sigma(trust at the goal), under the posterior mean. The first path minimises the cost
 under one draw of the prior."""
+
+MEAN_TRUST: Mapping[str, Any] = {**CAMPAIGN, "objective": "mean"}
+"""Keywords like `CAMPAIGN`, but each path maximises the mean trust over its bounds. The paper also
+describes the best path as the one with the maximum expected trust. The cost (6) hardly depends on
+the path: all paths have the same goal, and trust forgets earlier bounds."""

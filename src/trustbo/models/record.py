@@ -43,11 +43,12 @@ def model_from_record(
         return given
 
     # The priors are default if one of these models has the record: `Priors.default` (the object
-    # itself, which stands for priors by feature), equal priors as another object, or
-    # `Priors.from_features`.
+    # itself, which stands for priors by feature), equal priors as another object,
+    # `Priors.from_features` or `Priors.for_cells`.
     default = with_default_priors(record)
     of_features = Priors.from_features(features, record["family"])
-    for priors in (default.priors, replace(default.priors), of_features):
+    of_cells = Priors.for_cells(record["family"])
+    for priors in (default.priors, replace(default.priors), of_features, of_cells):
         model = replace(default, priors=priors)
         if model_to_record(model) == record:
             return model
