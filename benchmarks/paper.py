@@ -292,11 +292,7 @@ def print_priors(n_draws: int = 2000, n_paths: int = 40) -> None:
             campaign = tb.Campaign(workspace, START, GOAL, **settings | random)
             path = campaign.ask().path
             draws = campaign.draw_prior(n_draws // n_paths)
-            simulators = [
-                tb.simulation.ModelSimulator(workspace, draws.draw(i))
-                for i in range(draws.leading[0])
-            ]
-            rates += [s.run(path, seed=i).contact_rate for i, s in enumerate(simulators)]
+            rates.append(rates_of(draws, workspace.along(path), seed))
             if seed < 5:
                 shown = campaign.trust_map.values.copy()
                 shown[START] = np.nan
@@ -306,6 +302,21 @@ def print_priors(n_draws: int = 2000, n_paths: int = 40) -> None:
         low, high = np.quantile(values, [0.05, 0.95])
         inside = np.mean((values >= 0.0) & (values <= 1.0))
         table.row(name, f"{inside:.1%}", f"{low:.2f} to {high:.2f}", "; ".join(maps))
+
+
+def rates_of(draws: Any, awareness: np.ndarray, seed: int) -> np.ndarray:
+    """Draw contact rates by equations (3) and (4), which do not limit them to [0, 1]."""
+    rng = np.random.default_rng(seed)
+    n_draws = len(draws.beta0)
+    n_robots = awareness.shape[1]
+    rates = np.empty((n_draws, *awareness.shape[:2]))  # (draw, bound, robot)
+    x = rng.normal(draws.x0_mean[:, None], draws.x0_sd[:, None], (n_draws, n_robots))
+    for k, z in enumerate(awareness):
+        w = draws.delta_w[:, None] * rng.standard_normal(x.shape)
+        v = draws.delta_v[:, None] * rng.standard_normal(x.shape)
+        x = draws.beta0[:, None] * x + draws.beta @ z.T + draws.b[:, None] + w
+        rates[:, k] = x + v
+    return rates
 
 
 def print_seconds(n_missions: int = 8) -> None:
