@@ -19,8 +19,8 @@ Data:
 - Learning uses the awareness of the map. In the paper, robots measure awareness in every bound.
 - Each feature is a principal component as in the paper, but of clipped pixel features, and its sign
   is declared instead of left to the solver.
-- In phase 1 of a bound, contact is that of the robots' lidars; in phase 2, that of the lead's lidar.
-- The lead stops where it is seen best in the central part of the next cell, not at the centre.
+- While T2 closes up, contact is that of the lead's lidar, and counts in the rates of the robots.
+- The lead stops near the centre of the next cell, where the routes around are seen best.
 - Campaigns start from the prior and learn from all of their missions at once. In the paper, the
   posterior of a given terrain is the prior on the mission terrain.
 

@@ -141,7 +141,6 @@ class Priors(Summary):
             )
 
     @classmethod
-    @cache
     def for_cells(cls, family: str = "gaussian") -> "Priors":
         """Return priors for awareness of cells without line of sight, on the scale of contact.
 
