@@ -195,10 +195,8 @@ def sd_of_weights(campaign: tb.Campaign) -> float:
     if "beta" in posterior:
         return float(posterior["beta"].std(sample).mean())
 
-    # B_m of the coupled model: the weights of a robot's own awareness are on the diagonals.
-    B = posterior["B"].transpose(..., "robot", "robot_", "feature")
-    own = np.diagonal(B.std(sample).values, axis1=0, axis2=1)
-    return float(own.mean())
+    # In the coupled model, the effect of awareness that is equal for all robots.
+    return float(posterior["B"].sum("robot_").std(sample).mean())
 
 
 def summarised(rows: pd.DataFrame, n_missions: int) -> pd.DataFrame:
