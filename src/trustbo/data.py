@@ -117,6 +117,8 @@ class Mission(Summary):
         robots: Names of the overwatching robots.
         scale: Scale of a person's trust reports, such as `"likert7"`, if `contact_rate` holds such
             reports instead of contact (see `logs.read_reports`); empty in all other missions.
+        map: Name of the map to which the cells belong, if it is not the workspace of the missions
+            that are fitted together. Places on different maps have independent effects.
 
     Raises:
         TrustboError: The bounds do not fit the path, or disagree on robots or features, or the
@@ -129,6 +131,7 @@ class Mission(Summary):
     features: tuple[str, ...] = ()
     robots: tuple[str, ...] = ()
     scale: str = ""
+    map: str = ""
 
     def __post_init__(self) -> None:
         require_choice("status", self.status, STATUSES)
@@ -325,9 +328,31 @@ class Mission(Summary):
 
         return replace(self, bounds=tuple(bounds), **names)
 
+    def with_robots(self, robots: Sequence[str]) -> Self:
+        """Return the mission with these robots, which include its own; others have no rates.
+
+        The awareness of other robots is 0, which has no influence without rates. Ticks are left
+        out.
+        """
+        if tuple(robots) == self.robots:
+            return self
+        where = [robots.index(name) for name in self.robots]
+
+        bounds = []
+        for bound in self.bounds:
+            changes: dict[str, Any] = {"poses": None, "contact": None}
+            for name in ("awareness", "contact_rate", "duration", "n_ticks"):
+                own = getattr(bound, name)
+                fill = 0.0 if name == "awareness" else np.nan
+                changes[name] = np.full((len(robots), *own.shape[1:]), fill)
+                changes[name][where] = own
+            bounds.append(replace(bound, **changes))
+
+        return replace(self, bounds=tuple(bounds), robots=tuple(robots))
+
     def has_same_data(self, other: "Mission") -> bool:
         """Return whether another mission has the same path, outcome and measurements."""
-        about = ("path", "status", "features", "robots", "scale")
+        about = ("path", "status", "features", "robots", "scale", "map")
         if any(getattr(self, name) != getattr(other, name) for name in about):
             return False
         if [bound.status for bound in self.bounds] != [bound.status for bound in other.bounds]:

@@ -21,6 +21,32 @@ def known_awareness(missions: Sequence[Mission]) -> list[int]:
     return known
 
 
+def names_of_all(robots: Sequence[str], missions: Sequence[Mission]) -> tuple[str, ...]:
+    """Return names of robots, and then those of other robots in missions, in order."""
+    names = dict.fromkeys(robots)
+    for mission in missions:
+        names |= dict.fromkeys(mission.robots)
+    return tuple(names)
+
+
+def pooled(robots: Sequence[str], missions: Sequence[Mission]) -> list[Mission]:
+    """Return missions with the same robots: these robots, and then others in the missions."""
+    every = names_of_all(robots, missions)
+    return [mission.with_robots(every) for mission in missions]
+
+
+def require_same_robots(what: str, missions: Sequence[Mission], robots: Sequence[str]) -> None:
+    """Raise TrustboError if an earlier mission had other robots; see `Mission.with_robots`."""
+    for mission in missions:
+        absent = np.isnan(mission.contact_rate).all(0) & ~mission.awareness.any((0, 2))
+        names = [n for n, is_absent in zip(mission.robots, absent, strict=True) if not is_absent]
+        if sorted(names) != sorted(robots):
+            raise TrustboError(
+                f"{what} needs the same robots in all missions, {', '.join(robots)}; an earlier "
+                f"mission was run by {', '.join(names)}."
+            )
+
+
 def require_same_team(missions: Sequence[Mission]) -> None:
     """Raise TrustboError unless there are missions, all with the same robots and features."""
     if not isinstance(missions, Sequence) or not missions:

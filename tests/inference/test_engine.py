@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from dense_coefficients import DenseRates
 from dense_families import with_one_limit
-from every_model import FEATURES, models_of, observed
+from every_model import FEATURES, GRID, models_of, observed
 from numpyro import handlers
 
 from trustbo.inference import engine, factor
 from trustbo.inference.density import Density, at
 from trustbo.models.backend import own_settings
+from trustbo.models.visited import visited
 
 GAUSSIAN = models_of("gaussian")
 CENSORED = models_of("censored")
@@ -62,6 +63,58 @@ def test_the_evidence_with_one_rate_at_a_limit_has_the_normal_tail_beyond_it(nam
     cov = joint.cov + joint.noise
     expected = [with_one_limit(*moments, joint.y) for moments in zip(joint.mean, cov, strict=True)]
     np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-9)
+
+
+MAPS = np.array([1, 0, 2, 0])
+"""Maps of four missions; 0 is that of the workspace."""
+
+
+def posterior_on_maps(name):
+    """As `posterior_of`, with missions on three maps; in the reference, these are far apart."""
+    model = GAUSSIAN[name].for_features(FEATURES)
+    observations, bounds = observed(gaps=True)
+    posterior = Density(model, observations._replace(visited=visited(bounds, GRID, MAPS)))
+    z = 0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores))
+
+    apart = bounds.copy()
+    apart[..., 1] += 10_000 * MAPS[:, None]
+    return posterior, posterior.theta(z), lambda at: DenseRates(model, observations, at, apart)
+
+
+@pytest.mark.parametrize("name", [name for name in GAUSSIAN if "places" in name])
+def test_places_on_other_maps_have_independent_effects(name):
+    posterior, theta, dense = posterior_on_maps(name)
+    expected = dense(theta).log_density()
+    np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-9)
+
+
+def test_effects_of_cells_given_missions_on_other_maps_are_those_of_the_joint_normal():
+    posterior, theta, dense = posterior_on_maps("pooled, places")
+    places = posterior.observations.visited
+    assert places.cell_map.tolist() == sorted(places.cell_map)
+    drawn = posterior.draw_coefficients(at(theta, np.zeros(4000, int)), np.random.default_rng(0))
+    mean, cov = (moment[0] for moment in dense(theta).coefficients())
+    sd = np.sqrt(np.diag(cov))
+    some = slice(len(FEATURES) + 1 + len(places.cells))  # bounds are in another order
+    assert (np.abs(drawn.mean(0) - mean)[some] < 5.0 * sd[some] / np.sqrt(4000)).all()
+    np.testing.assert_allclose(drawn.std(0)[some], sd[some], rtol=5.0 / np.sqrt(8000))
+
+
+def test_slopes_with_places_on_other_maps_in_jax_are_those_in_numpy():
+    posterior, *_ = posterior_on_maps(f"pooled, {EVERYTHING}")
+    z = 0.5 * np.random.default_rng(3).standard_normal(posterior.n_scores)
+    steps = 1e-4 * np.eye(len(z))
+    expected = (posterior.log_density(z + steps) - posterior.log_density(z - steps)) / 2e-4
+    with own_settings():
+        found = jax.grad(lambda one: posterior.log_density(one[None])[0])(jax.numpy.asarray(z))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_first_missions_keep_their_maps():
+    posterior, *_ = posterior_on_maps("pooled, places")
+    few = posterior.observations.visited.first(2)
+    assert sorted(set(few.bound_map.tolist())) == [0, 1]
+    assert few.at.shape[0] == 2
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
+from trustbo.campaign.earlier import earlier_missions
 from trustbo.campaign.folder import FolderStorage
 from trustbo.campaign.learning import (
     as_learned,
@@ -97,8 +98,11 @@ class Campaign(Result):
         hazard: Hazard | None = None,
         planner: Mapping[str, Any] | None = None,
         fit: Mapping[str, Any] | None = None,
+        earlier: Result | Sequence[Result] | None = None,
     ) -> None:
         """Check the arguments and prepare the campaign; no path is planned yet.
+
+        With `earlier`, the campaign learns from the missions of earlier campaigns first.
 
         Args:
             workspace: Workspace of the paths.
@@ -121,11 +125,16 @@ class Campaign(Result):
             planner: Further options of `planning.Planner`, such as `{"max_failure": 0.1}`. Failures
                 have no cost until the first one is recorded, unless `failure_cost` is given.
             fit: Further options of `trustbo.fit`, such as `{"draws": 500}`.
+            earlier: Results or campaigns whose missions are data of this one, so that their
+                posterior is its prior. They may have other courses, terrains and teams. Robots are
+                matched by name. What was learned about places is used only if the map is the same.
 
         Raises:
             TrustboError: The start or goal is not a passable cell, a name is unknown, the sampler
                 does not support the model, an option cannot be stored in a file, or the folder
-                already contains a campaign or cannot be written.
+                already contains a campaign or cannot be written. Or an earlier campaign has other
+                features, no robot of the team, or no mission to learn from, or the model cannot be
+                fitted to its missions.
             NoPathError: The goal cannot be reached.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
@@ -155,15 +164,30 @@ class Campaign(Result):
             fit=fit_options,
         )
 
-        state = State(settings)
+        state = State(settings, earlier=earlier_missions(earlier, workspace))
+        learner.require_poolable(state.earlier.missions, workspace)
         super().__init__(workspace, state, learner, base)
 
         self._progress = True  # of fits
         self._has_warned_of_risk = False
+        if state.earlier.missions:
+            self._learn_from_earlier()
         self.storage: Storage = MemoryStorage()
         self._turn = self.storage.turn
         if directory is not None:
             self.store_in(directory, overwrite=overwrite)
+
+    def _learn_from_earlier(self) -> None:
+        """Fit the posterior given the missions of earlier campaigns."""
+        state = self.state
+        seed = state.seed_of("fit")
+        tree, reason = learn(state, self.learner, self.workspace, seed, self._progress)
+        if tree is None:
+            raise TrustboError(f"nothing can be learned from the earlier missions: {reason}")
+
+        tree["hazard"] = xr.DataTree(self.hazard)
+        state.initial = Posterior("0000", tree)
+        self._computed = {"hazard": self.hazard}
 
     def store_in(self, directory: FilePath, *, overwrite: bool = False) -> None:
         """Write the campaign to a folder, and record everything there from now on.
@@ -230,7 +254,7 @@ class Campaign(Result):
                 for j in state.indices(TOLD):
                     state.entries[j].become(TOLD, reason)
             else:
-                state.entries[-1].posterior = None
+                state.entries[-1].posterior = state.initial
             self._computed = {"hazard": hazard}
 
         if reason:

@@ -1,8 +1,10 @@
 """Folder of a campaign, with one file for each mission and one for each posterior.
 
     workspace.nc          written once
+    earlier.nc            missions of earlier campaigns, if there are any; written once
     missions/0001.nc      measurements and plan of the first mission, written before learning
-    posteriors/0001.nc    draws of the parameters after the first mission
+    posteriors/0001.nc    draws of the parameters after the first mission; 0000.nc contains those
+                          given the missions of earlier campaigns, if there are any
     campaign.json         settings, the rows of completed missions, failures, and hashes of the
                           other files; written last
 
@@ -19,8 +21,10 @@ from typing import Self
 
 import xarray as xr
 
+from trustbo.campaign.earlier import earlier_to_tree
 from trustbo.campaign.lock import FolderLock
 from trustbo.campaign.record import (
+    EARLIER,
     RECORD,
     WORKSPACE,
     mission_file,
@@ -146,9 +150,8 @@ class FolderStorage:
         """Write the posteriors that have no files yet, and then campaign.json."""
         self.require_open()
 
-        for entry in state.entries:
-            posterior = entry.posterior
-            if posterior is None or posterior.tree is None:
+        for posterior in state.stored:
+            if posterior.tree is None:
                 continue
             if posterior.file is None:
                 name = posterior_file(posterior.name)
@@ -195,12 +198,12 @@ def _entry_to_tree(entry: Entry) -> xr.DataTree:
 def _contents(workspace: Workspace, state: State) -> Iterator[tuple[str, bytes]]:
     """Make the files of a campaign, except campaign.json: path in the folder, and content."""
     yield WORKSPACE, tree_to_bytes(workspace_to_tree(workspace))
+    if state.earlier.missions:
+        yield EARLIER, tree_to_bytes(earlier_to_tree(state.earlier))
 
-    posteriors = {}
     for n, entry in enumerate(state.entries, start=1):
         yield mission_file(n), tree_to_bytes(_entry_to_tree(entry))
-        if entry.posterior is not None:
-            posteriors[entry.posterior.name] = entry.posterior
+    posteriors = {posterior.name: posterior for posterior in state.stored}
     for name, posterior in posteriors.items():
         yield posterior_file(name), _content_of(posterior)
 
@@ -218,16 +221,17 @@ def _content_of(posterior: Posterior) -> bytes:
 
 def without_lost_posteriors(state: State) -> State:
     """Return a state without the posteriors whose files cannot be read any more, with a warning."""
-    entries = []
+    initial = state.initial
     lost = []
+    if initial is not None and _is_lost(initial):
+        initial = None
+        lost.append(0)
+
+    entries = []
     for n, entry in enumerate(state.entries, start=1):
-        posterior = entry.posterior
-        if posterior is not None and posterior.tree is None and posterior.file is not None:
-            try:
-                read_file(*posterior.file)
-            except TrustboError:
-                entry = replace(entry, posterior=None)
-                lost.append(n)
+        if entry.posterior is not None and _is_lost(entry.posterior):
+            entry = replace(entry, posterior=None)
+            lost.append(n)
         entries.append(entry)
 
     if not lost:
@@ -236,7 +240,18 @@ def without_lost_posteriors(state: State) -> State:
         f"the posteriors after the missions {lost} cannot be read and are not saved. The missions "
         "are complete."
     )
-    return replace(state, entries=entries)
+    return replace(state, entries=entries, initial=initial)
+
+
+def _is_lost(posterior: Posterior) -> bool:
+    """Return whether a posterior cannot be read any more."""
+    if posterior.tree is not None or posterior.file is None:
+        return False
+    try:
+        read_file(*posterior.file)
+    except TrustboError:
+        return True
+    return False
 
 
 def _write_first(folder: Path, workspace: Workspace, state: State) -> dict[str, str]:

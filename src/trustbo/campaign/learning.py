@@ -1,5 +1,7 @@
 """Learning from missions: the posterior, the hazard, and the planner of the next path."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 
@@ -12,6 +14,7 @@ from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import LostMission
 from trustbo.inference.learner import Learner
 from trustbo.planning import Planner
+from trustbo.stacking import pooled
 from trustbo.workspace import Workspace
 
 _N_RISKS = 200
@@ -53,8 +56,8 @@ def learn(
 ) -> tuple[xr.DataTree | None, str]:
     """Fit the posterior of the parameters to all missions that are not excluded.
 
-    The attribute `missions` of the posterior lists the indices of these missions. The state does
-    not change.
+    Missions of earlier campaigns come first. The attribute `missions` of the posterior lists the
+    indices of the missions, which are negative for earlier campaigns. The state does not change.
 
     Returns:
         The posterior and an empty text; or, if the fit fails, None and the reason.
@@ -69,6 +72,7 @@ def learn(
             seed=seed,
             progress=progress,
             start=_previous(state),
+            earlier=usable(state.earlier.missions),
             **state.settings["fit"],
         )
     except TrustboError as error:
@@ -78,8 +82,27 @@ def learn(
             raise error.__cause__ from None
         return None, f"{type(error).__name__}: {error}"
 
-    tree.attrs["missions"] = used
+    tree.attrs["missions"] = labels_of(state, used)
     return tree, ""
+
+
+def usable(missions: Sequence[Mission]) -> list[Mission]:
+    """Return the missions from which trust can be learned."""
+    return [mission for mission in missions if not why_never_learned(mission)]
+
+
+def labels_of(state: State, used: Sequence[int]) -> list[int]:
+    """Return the indices of all missions in a fit: earlier ones are -n, ..., -1."""
+    return [*range(-len(usable(state.earlier.missions)), 0), *used]
+
+
+def fitted_missions(state: State, labels: Sequence[int]) -> list[Mission]:
+    """Return the missions in a fit by their indices; see `labels_of`."""
+    earlier = usable(state.earlier.missions)
+    own = [state.entries[j].mission for j in labels if j >= 0]
+    n_earlier = sum(j < 0 for j in labels)
+    missions = [*earlier[len(earlier) - n_earlier :], *own]
+    return pooled(missions[0].robots, missions)
 
 
 def _previous(state: State) -> xr.DataTree | None:
@@ -94,13 +117,15 @@ def learn_hazard(state: State, workspace: Workspace, so_far: Mission | None = No
     """Fit the failure probabilities of bounds to all missions; see `fit_hazard`.
 
     Missions that cannot be used for learning trust are included, since they show where the team
-    failed, and so are the bounds `so_far` of a mission in progress. If the diagnostics fail, the
-    previous posterior is returned with a warning.
+    failed. So are missions of earlier campaigns on the same map, and the bounds `so_far` of a
+    mission in progress. If the diagnostics fail, the previous posterior is returned with a warning.
     """
-    measured = [entry.measured for entry in state.entries if not is_excluded_by_user(entry)]
+    measured = [mission for mission in state.earlier.missions if not mission.map]
+    measured += [entry.measured for entry in state.entries if not is_excluded_by_user(entry)]
     if so_far is not None:
         measured.append(so_far)
-    lost = [LostMission(f.path, f.where) for f in state.failures if f.path]
+    lost = list(state.earlier.lost)
+    lost += [LostMission(f.path, f.where) for f in state.failures if f.path]
     prior = Hazard(**state.settings["hazard"])
     try:
         return fit_hazard(measured, workspace, prior, lost=lost, seed=state.seed_of("hazard"))

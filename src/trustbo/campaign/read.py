@@ -3,9 +3,11 @@
 import json
 from pathlib import Path
 
+from trustbo.campaign.earlier import earlier_from_tree
 from trustbo.campaign.learning import as_learned
 from trustbo.campaign.lock import FolderLock
 from trustbo.campaign.record import (
+    EARLIER,
     MISSIONS,
     RECORD,
     WORKSPACE,
@@ -65,8 +67,9 @@ def read_campaign(
         files = {str(name): str(sha256) for name, sha256 in record["files"].items()}
         rows = [dict(row) for row in record["rows"]]
         names = [None if name is None else str(name) for name in record["posteriors"]]
+        initial = record["initial"]
         stored = {}
-        for name in names:
+        for name in [initial, *names]:
             if name is not None:
                 file = posterior_file(name)
                 stored[name] = Posterior(name, file=StoredFile(folder / file, files[file]))
@@ -76,6 +79,12 @@ def read_campaign(
         workspace = workspace_from_tree(tree)
     with interpreting(path):
         state = state_from_record(record, workspace)
+    state.initial = None if initial is None else stored[initial]
+
+    if EARLIER in files:
+        tree = read_tree(folder / EARLIER, files[EARLIER])
+        with interpreting(folder / EARLIER):
+            state.earlier = earlier_from_tree(tree)
 
     entries = _read_entries(folder, workspace, files, len(rows))
     for entry, row, name in zip(entries, rows, names, strict=False):

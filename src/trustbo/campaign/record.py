@@ -15,6 +15,8 @@ from trustbo.workspace import Workspace
 
 RECORD = "campaign.json"
 WORKSPACE = "workspace.nc"
+EARLIER = "earlier.nc"
+"""File of the missions of earlier campaigns, if there are any."""
 MISSIONS = "missions"
 """Folder of the missions in the folder of a campaign."""
 POSTERIORS = "posteriors"
@@ -45,6 +47,7 @@ def record_to_bytes(state: State, files: Mapping[str, str]) -> bytes:
         "asked": None if state.asked is None else plan_to_record(state.asked),
         "rows": [entry.row for entry in state.entries],
         "posteriors": [entry.posterior and entry.posterior.name for entry in state.entries],
+        "initial": state.initial and state.initial.name,
         "due": state.due,
         "failures": state.failures,
         "stop_reason": state.stop_reason,

@@ -11,7 +11,7 @@ import xarray as xr
 
 from trustbo.campaign.cache import computed
 from trustbo.campaign.folder import FolderStorage, without_lost_posteriors
-from trustbo.campaign.learning import informed_planner, learn_hazard
+from trustbo.campaign.learning import fitted_missions, informed_planner, learn_hazard
 from trustbo.campaign.read import read_campaign
 from trustbo.campaign.record import RECORD
 from trustbo.campaign.settings import to_planner
@@ -84,14 +84,24 @@ class Result(Summary):
         rows = [
             ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
             ("missions", ", ".join(shown) or "none yet"),
+            *self._rows_of_earlier(),
             ("model", settings["model"]),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
 
         if state.last is not None:
             best = f"{len(self.path) - 1} bounds, value {self.plan.value:.3g}"
-            rows += [("recommended", best), ("last mission", in_a_line(state.entries[-1].row))]
+            rows.append(("recommended", best))
+        if state.entries and state.last is not None:
+            rows.append(("last mission", in_a_line(state.entries[-1].row)))
         return rows
+
+    def _rows_of_earlier(self) -> Rows:
+        missions = self.state.earlier.missions
+        if not missions:
+            return []
+        n_here = sum(not mission.map for mission in missions)
+        return [("earlier missions", f"{n_here} on this map, {len(missions) - n_here} elsewhere")]
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -119,7 +129,8 @@ class Result(Summary):
     def posterior(self) -> xr.DataTree:
         """Posterior after the last mission, with all groups, for ArviZ.
 
-        Its missions are labelled by their index in `missions`. To add all groups to an earlier
+        Its missions are labelled by their index in `missions`. Those of earlier campaigns come
+        first and have negative labels, -1 for the last. To add all groups to an earlier
         posterior, use `inference.add_latent`.
 
         Raises:
@@ -133,7 +144,7 @@ class Result(Summary):
             )
 
         indices = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
-        whole = self.learner.add_latent(stored, [self.missions[j] for j in indices])
+        whole = self.learner.add_latent(stored, fitted_missions(self.state, indices))
 
         for group in whole.children.values():
             if "mission" in group.dims:

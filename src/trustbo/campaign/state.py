@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell, Mission, path_text
+from trustbo.hazard.trials import LostMission
 from trustbo.logs.netcdf import read_tree
 from trustbo.planning import Plan
 
@@ -113,6 +114,19 @@ class Entry:
         self.row = self.row | {"state": state, "reason": reason}
 
 
+class EarlierMissions(NamedTuple):
+    """Missions of earlier campaigns; see `earlier`.
+
+    Attributes:
+        missions: Measured missions with the awareness used for learning. All have the same robots:
+            those of the campaign, and then the others.
+        lost: Missions without measurements in which a bound of the campaign's map failed.
+    """
+
+    missions: tuple[Mission, ...] = ()
+    lost: tuple[LostMission, ...] = ()
+
+
 @dataclass(eq=False)
 class State:
     """Data of a campaign: the contents of its folder, except for the workspace.
@@ -126,6 +140,8 @@ class State:
         stop_reason: Why the last run ended.
         due: Seed of the fit that is due because the missions have changed; None if the posterior
             is up to date, or if learning is retried after the next mission.
+        earlier: Missions of earlier campaigns, which enter every fit.
+        initial: Posterior given the missions of earlier campaigns; None if there are none.
     """
 
     settings: dict[str, Any]
@@ -135,11 +151,19 @@ class State:
     simulation: dict[str, Any] = field(default_factory=dict)
     stop_reason: str = "interrupted"
     due: int | None = None
+    earlier: EarlierMissions = field(default_factory=EarlierMissions)
+    initial: Posterior | None = None
 
     @property
     def last(self) -> Posterior | None:
         """Posterior after the last mission; None if no mission has been used for learning."""
-        return self.entries[-1].posterior if self.entries else None
+        return self.entries[-1].posterior if self.entries else self.initial
+
+    @property
+    def stored(self) -> list[Posterior]:
+        """All posteriors, in order and without duplicates."""
+        found = [self.initial, *(entry.posterior for entry in self.entries)]
+        return list(dict.fromkeys(posterior for posterior in found if posterior is not None))
 
     @property
     def posterior(self) -> xr.DataTree | None:

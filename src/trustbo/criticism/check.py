@@ -18,6 +18,7 @@ from trustbo.inference.draws import (
     parameters_of,
     theta_of,
 )
+from trustbo.inference.place_maps import of_workspace
 from trustbo.inference.score import last_posterior, predictions, score
 from trustbo.models.families import FAMILIES
 from trustbo.parallel import computing
@@ -124,11 +125,15 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
     draws = draws / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
 
+    # Missions of earlier campaigns, which have negative indices, only serve as a reference.
+    own = group["mission"].values >= 0
+    draws = draws[:, own]
+
     probability = np.maximum((draws < -SIZE).mean(0), (draws > SIZE).mean(0))
     columns = {"effect": draws.mean(0), "sd": draws.std(0), "probability": probability}
     columns["stands_out"] = probability > SURE
 
-    labels = group["mission"].values + 1, group["robot"].values
+    labels = group["mission"].values[own] + 1, group["robot"].values
     index = pd.MultiIndex.from_product(labels, names=("mission", "robot"))
     return pd.DataFrame({n: v.ravel() for n, v in columns.items()}, index).reset_index()
 
@@ -164,7 +169,9 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     """Check whether the effect of a place on stationary trust is large."""
     if "places" not in posterior.children:
         return Finding("not tested: the model has no place effects")
-    places = posterior["places"].to_dataset()
+    places = of_workspace(posterior["places"].to_dataset())
+    if not places.sizes["bound"]:
+        return Finding("not tested: no place of the workspace was visited")
     cells = list(zip(places["cell_row"].values, places["cell_col"].values, strict=True))
     where = list(zip(places["bound_row"].values, places["bound_col"].values, strict=True))
     of_cells = joined_draws(places["place"])[:, [cells.index(cell) for cell in where]]

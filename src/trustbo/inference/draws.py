@@ -210,8 +210,13 @@ def in_order_of(
 ) -> xr.DataTree:
     """Return a posterior with its robots and features in the order of these names.
 
-    Parameters that all robots share apply to any robots. Raises TrustboError if names differ.
+    Parameters that all robots share apply to any robots. Robots that occur only in missions of
+    earlier campaigns (attribute `other_robots`) are left out, unless they are among `robots`.
+    Raises TrustboError if names differ.
     """
+    others = np.atleast_1d(posterior.attrs.get("other_robots", [])).tolist()
+    if others and not set(others) <= set(robots):
+        posterior = _without_robots(posterior, [name for name in others if name not in robots])
     is_shared = "robot" not in posterior["posterior"].dims and "robots" not in posterior.children
     order = {}
     for axis, names in {"feature": list(features), "robot": list(robots)}.items():
@@ -241,6 +246,18 @@ def in_order_of(
     )
     ordered.attrs = posterior.attrs
     return ordered
+
+
+def _without_robots(posterior: xr.DataTree, others: Sequence[str]) -> xr.DataTree:
+    """Return a posterior without some robots."""
+
+    def drop(group: xr.Dataset) -> xr.Dataset:
+        axes = [axis for axis in ("robot", "robot_") if axis in group.indexes]
+        return group.drop_sel({axis: list(others) for axis in axes})
+
+    kept = xr.DataTree.from_dict({n: drop(g.to_dataset()) for n, g in posterior.children.items()})
+    kept.attrs = posterior.attrs | {"n_robots": posterior.attrs["n_robots"] - len(others)}
+    return kept
 
 
 def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
@@ -379,5 +396,7 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
             robots=robots,
             features=features,
         )
+        if "map" in one:
+            mission = replace(mission, map=str(one["map"].values))
         missions.append(mission)
     return missions

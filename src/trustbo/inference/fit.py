@@ -40,7 +40,7 @@ from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_to_record
 from trustbo.models.visited import has_places
 from trustbo.parallel import computing
-from trustbo.stacking import known_awareness, require_same_team
+from trustbo.stacking import known_awareness, pooled, require_same_robots, require_same_team
 from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
@@ -63,6 +63,7 @@ def fit(
     missions: Sequence[Mission],
     model: TrustModel | Callable[..., Any] | None = None,
     *,
+    earlier: Sequence[Mission] = (),
     sampler: str | None = None,
     workspace: Workspace | None = None,
     draws: int = 1000,
@@ -83,6 +84,9 @@ def fit(
             `models.default_model()` with place and robot effects; place effects are omitted if a
             mission has no map or a path jumps. For reports of people (see `logs.read_reports`), the
             default is `HumanTrust` with the scale of the reports.
+        earlier: Missions of earlier campaigns, which are data like `missions` and come first. They
+            are not changed to match the workspace. Their robots are matched by name, and may be
+            others; their places are those of the workspace only if `Mission.map` is "".
         sampler: `"importance"` takes independent draws by adaptive importance sampling without
             compilation, and integrates out all variables except hyperparameters. `"nuts"` uses
             NumPyro's NUTS, which also samples trust unless rates are Gaussian. By default
@@ -127,12 +131,7 @@ def fit(
         >>> az.summary(posterior)
     """
     started = time.perf_counter()
-    require_same_team(missions)
-    if workspace is not None:
-        require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
-        missions = [workspace.fill(mission) for mission in missions]
-        missions = [missions[j] for j in known_awareness(missions)]
-        require_same_team(missions)  # also that one is left
+    missions, robots = _joined(missions, earlier, workspace)
 
     if model is None:
         scale = missions[0].scale  # empty unless the missions are people's reports
@@ -149,6 +148,7 @@ def fit(
     if isinstance(model, TrustModel | type) or not callable(model):
         remedy = "give a model such as PooledTrust(), or a NumPyro function"
         trust_model: TrustModel = require_kind("model", model, TrustModel, remedy)
+        require_poolable_with_model(trust_model, earlier, robots)
         sampler = SAMPLERS[0] if sampler is None else require_choice("sampler", sampler, SAMPLERS)
         tree, complaints, add_latent = _fit_model(
             missions, trust_model, sampler, workspace, draws, chains, warmup, seed, progress, start
@@ -157,6 +157,7 @@ def fit(
         from trustbo.inference.functions import fit as of_function  # slow to import
 
         function = of_function.as_model(model)
+        of_function.require_poolable_with_function(function, earlier, robots)
         if sampler not in (None, "nuts"):
             raise TrustboError(f"a NumPyro function is sampled by 'nuts'; got {sampler!r}.")
         tree, complaints = of_function.fit_function(
@@ -179,8 +180,58 @@ def fit(
 
     if latent:
         tree = add_latent(tree)
+    if earlier:
+        _label_earlier(tree, len(earlier), missions[0].robots[len(robots) :])
     tree.attrs["seconds"] = time.perf_counter() - started
     return tree
+
+
+def require_poolable_with_model(
+    model: TrustModel, earlier: Sequence[Mission], robots: Sequence[str]
+) -> None:
+    """Raise TrustboError if a model needs the same robots in all missions, and `earlier` differs.
+
+    In missions of other robots, a robot has no rates. This needs no change unless robots influence
+    each other.
+    """
+    if model.joint and not model.exchangeable:
+        require_same_robots(type(model).__name__, earlier, robots)
+
+
+def _joined(
+    missions: Sequence[Mission], earlier: Sequence[Mission], workspace: Workspace | None
+) -> tuple[Sequence[Mission], tuple[str, ...]]:
+    """Return all missions, earlier ones first, and the robots of those that are not earlier."""
+    if missions or not earlier:
+        require_same_team(missions)
+    if workspace is not None:
+        require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
+        missions = [workspace.fill(mission) for mission in missions]
+        missions = [missions[j] for j in known_awareness(missions)]
+        if not earlier:
+            require_same_team(missions)  # also that one is left
+
+    if missions:
+        robots = missions[0].robots
+    else:
+        robots = earlier[0].robots if workspace is None else workspace.team.names
+    if not earlier:
+        return missions, robots
+
+    missions = pooled(robots, [*earlier, *missions])
+    require_same_team(missions)
+    return missions, robots
+
+
+def _label_earlier(tree: xr.DataTree, n_earlier: int, others: Sequence[str]) -> None:
+    """Label the earlier missions -n, ..., -1, and record which robots occur only in them."""
+    for group in tree.children.values():
+        if "mission" in group.dims:
+            n_missions = group.sizes["mission"]
+            labels = np.arange(n_missions) - n_earlier
+            group.dataset = group.to_dataset().assign_coords(mission=labels)
+    if others:
+        tree.attrs["other_robots"] = list(others)
 
 
 def _fit_model(

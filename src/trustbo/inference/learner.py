@@ -21,12 +21,13 @@ from trustbo.inference.draws import (
     require_posterior,
     sample_prior,
 )
-from trustbo.inference.fit import SAMPLERS, fit
+from trustbo.inference.fit import SAMPLERS, fit, require_poolable_with_model
 from trustbo.inference.functions.draws import FunctionDraws
 from trustbo.inference.functions.fit import (
     draws_of_function,
     prior_draws_of_function,
     require_plannable,
+    require_poolable_with_function,
     with_latent_of_function,
 )
 from trustbo.inference.functions.function import (
@@ -86,9 +87,14 @@ class Learner(Protocol):
         seed: int,
         progress: bool,
         start: xr.DataTree | None,
+        earlier: Sequence[Mission] = (),
         **options: Any,
     ) -> xr.DataTree:
         """Fit the parameters to missions, without the groups of `add_latent`; see `fit`."""
+        ...
+
+    def require_poolable(self, earlier: Sequence[Mission], workspace: Workspace) -> None:
+        """Raise TrustboError if the model cannot be fitted to missions of earlier campaigns."""
         ...
 
     def add_latent(self, posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
@@ -152,6 +158,7 @@ class ClassLearner:
         seed: int,
         progress: bool,
         start: xr.DataTree | None,
+        earlier: Sequence[Mission] = (),
         **options: Any,
     ) -> xr.DataTree:
         """See `Learner.fit`."""
@@ -162,6 +169,7 @@ class ClassLearner:
         tree = fit(
             missions,
             self._known,
+            earlier=earlier,
             sampler=sampler,
             workspace=workspace,
             seed=seed,
@@ -171,6 +179,10 @@ class ClassLearner:
             **options,
         )
         return parameters_alone(tree)
+
+    def require_poolable(self, earlier: Sequence[Mission], workspace: Workspace) -> None:
+        """See `Learner.require_poolable`."""
+        require_poolable_with_model(self._known, earlier, workspace.team.names)
 
     def add_latent(self, posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
         """See `Learner.add_latent`."""
@@ -233,12 +245,14 @@ class FunctionLearner:
         seed: int,
         progress: bool,
         start: xr.DataTree | None,
+        earlier: Sequence[Mission] = (),
         **options: Any,
     ) -> xr.DataTree:
         """See `Learner.fit`; the sampler is NUTS."""
         tree = fit(
             missions,
             self.model.function,
+            earlier=earlier,
             workspace=workspace,
             seed=seed,
             progress=progress,
@@ -247,6 +261,10 @@ class FunctionLearner:
             **options,
         )
         return parameters_alone(tree)
+
+    def require_poolable(self, earlier: Sequence[Mission], workspace: Workspace) -> None:
+        """See `Learner.require_poolable`."""
+        require_poolable_with_function(self.model, earlier, workspace.team.names)
 
     def add_latent(self, posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
         """See `Learner.add_latent`."""

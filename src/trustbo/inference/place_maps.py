@@ -42,7 +42,8 @@ def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> 
 
     Args:
         draws: Arrays place (chain, draw, cell) and place_bound (chain, draw, bound).
-        places: Visited places.
+        places: Visited places. If some are on other maps than the workspace, the coordinates
+            `cell_map` and `bound_map` are the numbers of the maps, 0 for the workspace.
         seed: Random seed for the maps that `params_of` draws.
     """
     variables = {
@@ -57,6 +58,9 @@ def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> 
         **{f"cell_{name}": ("cell", places.cells[:, i]) for i, name in enumerate(_CELL)},
         **{f"bound_{name}": ("bound", places.bounds[:, i]) for i, name in enumerate(_BOUND)},
     }
+    if places.bound_map.any():
+        coords["cell_map"] = "cell", places.cell_map
+        coords["bound_map"] = "bound", places.bound_map
     return xr.Dataset(variables, coords, {"shape": list(places.shape), "seed": seed})
 
 
@@ -71,6 +75,7 @@ def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> di
         Arrays place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The
         axis `effect` has length 1 because effects are common to all robots.
     """
+    group = of_workspace(group)
     rows, cols = (int(n) for n in group.attrs["shape"])
     seed = int(group.attrs["seed"])
 
@@ -88,10 +93,18 @@ def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> di
     return {"place": place[:, None], "place_bound": place_bound[:, None]}
 
 
+def of_workspace(group: xr.Dataset) -> xr.Dataset:
+    """Return the posterior group `places` without places on other maps."""
+    if "cell_map" not in group.coords:
+        return group
+    return group.isel(cell=group["cell_map"].values == 0, bound=group["bound_map"].values == 0)
+
+
 def _by_draw(group: xr.Dataset, name: str, axis: str) -> np.ndarray:
     """Return the effects (draw, place) of a variable with chains joined."""
     ordered = group[name].transpose("chain", "draw", ...)
-    return ordered.values.reshape(-1, group.sizes[axis])
+    n_draws = ordered.sizes["chain"] * ordered.sizes["draw"]
+    return ordered.values.reshape(n_draws, group.sizes[axis])  # also for 0 places
 
 
 def _cells(

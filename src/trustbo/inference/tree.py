@@ -139,6 +139,9 @@ def _data_groups(
     if not all(mission.path for mission in missions):
         counted["n_bounds"] = (("mission",), [len(mission.bounds) for mission in missions])
 
+    if any(mission.map for mission in missions):
+        counted["map"] = (("mission",), [mission.map for mission in missions])
+
     dims = _OF_RATES
     labelled = {name: coords[name] for name in _OF_RATES}
     rates = xr.Dataset({"contact_rate": (dims, observed.contact_rate)}, labelled)

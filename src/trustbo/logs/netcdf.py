@@ -148,6 +148,9 @@ def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
         dims = ("bound", "robot", "feature")[: values.ndim]
         variables[name] = (dims, values, {"units": units})
 
+    if any(mission.map for mission in missions):
+        variables["map"] = ("mission", [mission.map for mission in missions])
+
     names = {"robot": list(missions[0].robots), "feature": list(missions[0].features)}
     axes = {"axis": ["row", "col"], "component": ["x", "y", "heading"]}
     return xr.DataTree(xr.Dataset(variables, names | axes))
@@ -189,7 +192,8 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
 
         status = str(table["status"][j])
         scale = str(table["scale"][j])
-        missions.append(Mission(path, tuple(bounds), status, features, robots, scale))
+        on = str(table["map"][j]) if "map" in table else ""
+        missions.append(Mission(path, tuple(bounds), status, features, robots, scale, on))
     return missions
 
 

@@ -13,19 +13,25 @@ _MOST = 4000  # maximum number of visited bounds; the cost grows with the cube o
 
 
 class Visited(NamedTuple):
-    """Cells entered and directed bounds driven in missions, sorted and without duplicates."""
+    """Cells entered and directed bounds driven in missions, without duplicates.
 
-    shape: tuple[int, int]  # rows and columns of the grid
+    Places are sorted by map, row and column. Map 0 is that of the workspace.
+    """
+
+    shape: tuple[int, int]  # rows and columns of the workspace's grid
     cells: np.ndarray  # (cell, 2): row, col
     bounds: np.ndarray  # (bound, 3): move, row, col
     cell_of: np.ndarray  # (bound,), index of the cell entered
     at: np.ndarray  # (mission, bound), index of the visited bound, -1 in the padding
-    square: np.ndarray  # (cell, cell), squared distances, which are whole numbers
+    cell_map: np.ndarray  # (cell,), number of the map
+    bound_map: np.ndarray  # (bound,), number of the map
+    squares: tuple[np.ndarray, ...]  # of each map (cell, cell): squared distances, whole numbers
 
     def first(self, n: int) -> "Visited":
         """Return the places that the first n missions visited."""
         at = self.at[:n, :, None]
-        return visited(np.where(at >= 0, self.bounds[at[..., 0]], -1), self.shape)
+        bounds = np.where(at >= 0, self.bounds[at[..., 0]], -1)
+        return visited(bounds, self.shape, self.bound_map[at[:, 0, 0]])
 
 
 def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None) -> np.ndarray:
@@ -61,19 +67,35 @@ def has_places(missions: Sequence[Mission]) -> bool:
     return True
 
 
-def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited:
+def maps_of(missions: Sequence[Mission]) -> np.ndarray:
+    """Return the number (mission,) of the map of each mission, 0 for the workspace."""
+    numbers = {"": 0}
+    return np.array([numbers.setdefault(mission.map, len(numbers)) for mission in missions])
+
+
+def visited(
+    bounds: np.ndarray, shape: tuple[int, int] | None = None, maps: np.ndarray | None = None
+) -> Visited:
     """Index the places of bounds (mission, bound, 3); see `bounds_of`.
 
-    `shape` is the shape of the grid, by default ending at the last row and column visited. Raises
-    TrustboError if a cell is outside the grid, or if the missions visited more than 4000 bounds.
+    `shape` is the shape of the workspace's grid, by default ending at the last row and column
+    visited. `maps` (mission,) are the numbers of the maps, by default 0. Raises TrustboError if a
+    cell is outside the grid, or if the missions visited more than 4000 bounds.
     """
+    if maps is None:
+        maps = np.zeros(len(bounds), dtype=int)
     there = bounds[..., 0] >= 0
-    found, index_of = np.unique(bounds[there], axis=0, return_inverse=True)
+    on = np.broadcast_to(maps[:, None], there.shape)
+    placed, index_of = np.unique(
+        np.column_stack([on[there], bounds[there]]), axis=0, return_inverse=True
+    )
+    bound_map = placed[:, 0]
+    found = placed[:, 1:]
     if shape is None:
-        rows, cols = (found[:, 1:].max(0, initial=0) + 1).tolist()
+        rows, cols = (found[bound_map == 0, 1:].max(0, initial=0) + 1).tolist()
         shape = rows, cols
 
-    outside = there & (bounds[..., 1:] >= shape).any(-1)
+    outside = there & (on == 0) & (bounds[..., 1:] >= shape).any(-1)
     if outside.any():
         j, k = np.argwhere(outside)[0]
         raise TrustboError(
@@ -87,8 +109,15 @@ def visited(bounds: np.ndarray, shape: tuple[int, int] | None = None) -> Visited
             "Use larger cells, or omit PlaceEffect()."
         )
 
-    cells, cell_of = np.unique(found[:, 1:], axis=0, return_inverse=True)
+    entered, cell_of = np.unique(placed[:, [0, 2, 3]], axis=0, return_inverse=True)
+    cell_map = entered[:, 0]
+    cells = entered[:, 1:]
     at = np.full(there.shape, -1)
     at[there] = index_of.ravel()
-    square = ((cells[:, None] - cells) ** 2).sum(-1)
-    return Visited(shape, cells, found, cell_of.ravel(), at, square)
+
+    squares = []
+    for number in np.unique(cell_map):
+        here = cells[cell_map == number]
+        squares.append(((here[:, None] - here) ** 2).sum(-1))
+
+    return Visited(shape, cells, found, cell_of.ravel(), at, cell_map, bound_map, tuple(squares))

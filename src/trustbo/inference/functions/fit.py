@@ -37,6 +37,7 @@ from trustbo.inference.tree import N_PRIOR, kept_draws, to_datatree
 from trustbo.models.backend import VERSIONS, own_settings
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
+from trustbo.stacking import require_same_robots
 from trustbo.statespace import kalman
 from trustbo.statespace.form import Inputs, StateSpace
 from trustbo.streams import stream
@@ -47,6 +48,7 @@ __all__ = [
     "fit_function",
     "forms_of_function",
     "log_likelihood_of_function",
+    "require_poolable_with_function",
     "with_latent_of_function",
 ]
 
@@ -362,6 +364,23 @@ def require_plannable(model: FunctionModel, workspace: Workspace) -> None:
     """Raise TrustboError if a function cannot plan in a workspace."""
     draws = prior_draws_of_function(model, 2, 0, workspace)
     draws.require_plannable(workspace.awareness.values)
+
+
+def require_poolable_with_function(
+    model: FunctionModel, earlier: Sequence[Mission], robots: Sequence[str]
+) -> None:
+    """Raise TrustboError if a function cannot be fitted to missions of earlier campaigns.
+
+    A function reads robots by place, and the cells of another map would be read as those of the
+    workspace.
+    """
+    require_same_robots(model.in_short(), earlier, robots)
+    of_places = [name for name in ("cell", "bound") if name in model.inputs]
+    if of_places and any(mission.map for mission in earlier):
+        raise TrustboError(
+            f"{model.in_short()} takes the input {of_places[0]!r}, which has no meaning for "
+            "earlier missions on another map; leave them out, or give a function of awareness."
+        )
 
 
 def _data_for(

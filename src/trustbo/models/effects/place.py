@@ -15,7 +15,7 @@ from trustbo.models.backend import inverse
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
-from trustbo.models.visited import bounds_of, visited
+from trustbo.models.visited import bounds_of, maps_of, visited
 from trustbo.statespace.matrices import namespace
 from trustbo.workspace import Workspace
 
@@ -29,7 +29,9 @@ class PlaceEffect(Effect):
 
     The bound from cell a to c has the drift u(a -> c) = beta . z(a -> c) + b + s(c) + e(a -> c).
     Here s is a Gaussian process over cells with standard deviation tau_s and a Matern 3/2
-    covariance. The effects e(a -> c) ~ N(0, tau_e^2) of directed bounds are independent.
+    covariance. The effects e(a -> c) ~ N(0, tau_e^2) of directed bounds are independent. Missions
+    on another map (see `Mission.map`) have other places, whose effects are independent of those of
+    the workspace, with the same standard deviations and length scale.
 
     Attributes:
         tau_s: Scale of the half-normal prior on the standard deviation of s.
@@ -70,7 +72,7 @@ class PlaceEffect(Effect):
         """See `Effect.add_data`; adds the visited places."""
         shape: Any = None if on is None else on.passable.shape
         bounds = bounds_of(missions, observations.contact_rate.shape[:2])
-        return observations._replace(visited=visited(bounds, shape))
+        return observations._replace(visited=visited(bounds, shape, maps_of(missions)))
 
     def design(self, observations: Observations) -> Any:
         """Return indicator columns of the cells entered and of the directed bounds."""
@@ -91,7 +93,7 @@ class PlaceEffect(Effect):
         places: Any = observations.visited
         of_bound = xp.maximum(theta["tau_e"], LEAST) ** -2.0
         of_bounds = xp.repeat(of_bound[:, None], len(places.bounds), axis=1)
-        return None, [self._cells(theta, places.square), of_bounds]
+        return None, [*(self._cells(theta, square) for square in places.squares), of_bounds]
 
     def _cells(self, theta: Theta, square: np.ndarray) -> Any:
         """Compute the precision (point, cell, cell) of s from squared distances (cell, cell)."""
