@@ -229,7 +229,8 @@ def test_robots_are_matched_by_name(first):
     assert campaign.belief.n_robots in (None, 3)
     assert campaign.trust()["robot"].values.tolist() == ["new", "r2", "r1"]
     assert campaign.posterior["robots"]["robot"].values.tolist() == ["new", "r2", "r1", "r3"]
-    tb.score(campaign.posteriors, campaign.missions)
+    scores = tb.inference.score(campaign.posteriors, campaign.missions)
+    assert scores["robot"].values.tolist() == ["new", "r2", "r1"]
 
 
 def test_an_unknown_robot_informs_shared_parameters(first):
