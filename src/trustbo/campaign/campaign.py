@@ -99,6 +99,7 @@ class Campaign(Result):
         planner: Mapping[str, Any] | None = None,
         fit: Mapping[str, Any] | None = None,
         earlier: Result | Sequence[Result] | None = None,
+        progress: bool = True,
     ) -> None:
         """Check the arguments and prepare the campaign; no path is planned yet.
 
@@ -128,6 +129,7 @@ class Campaign(Result):
             earlier: Results or campaigns whose missions are data of this one, so that their
                 posterior is its prior. They may have other courses, terrains and teams. Robots are
                 matched by name. What was learned about places is used only if the map is the same.
+            progress: Whether to show progress bars of slow fits.
 
         Raises:
             TrustboError: The start or goal is not a passable cell, a name is unknown, the sampler
@@ -168,7 +170,7 @@ class Campaign(Result):
         learner.require_poolable(state.earlier.missions, workspace)
         super().__init__(workspace, state, learner, base)
 
-        self._progress = True  # of fits
+        self._progress = progress  # of fits
         self._has_warned_of_risk = False
         if state.earlier.missions:
             self._learn_from_earlier()

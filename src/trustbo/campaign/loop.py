@@ -56,7 +56,7 @@ def iterate(
         >>> result = tb.iterate(workspace, start=(9, 0), goal=(0, 9), n_iterations=8)
         >>> result.path
     """
-    campaign = Campaign(workspace, start, goal, **options)
+    campaign = Campaign(workspace, start, goal, progress=progress, **options)
     steps = campaign.run(simulator, n_iterations, stop=stop, progress=progress)
     with campaign:
         if directory is not None:  # after all input has been checked
