@@ -11,6 +11,7 @@ import xarray as xr
 from trustbo.campaign.earlier import earlier_missions
 from trustbo.campaign.folder import FolderStorage
 from trustbo.campaign.learning import (
+    AWARENESS,
     as_learned,
     informed_planner,
     is_excluded_by_user,
@@ -95,6 +96,7 @@ class Campaign(Result):
         directory: FilePath | None = None,
         overwrite: bool = False,
         initial: str = "prior_mean",
+        awareness: str = "map",
         hazard: Hazard | None = None,
         planner: Mapping[str, Any] | None = None,
         fit: Mapping[str, Any] | None = None,
@@ -122,6 +124,9 @@ class Campaign(Result):
                 of this process uses the folder, it is closed.
             initial: Parameters for the first plan: `"prior_mean"`, or `"prior_draw"` for one random
                 draw from the prior, as in the paper.
+            awareness: Awareness from which the model learns: `"map"` for that of the workspace, or
+                `"measured"`, as in the paper, for the measured awareness where it is finite, and
+                that of the workspace elsewhere. Plans use the workspace's.
             hazard: Priors of the probability that a bound fails; by default `Hazard()`.
             planner: Further options of `planning.Planner`, such as `{"max_failure": 0.1}`. Failures
                 have no cost until the first one is recorded, unless `failure_cost` is given.
@@ -141,6 +146,7 @@ class Campaign(Result):
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         require_choice("initial", initial, ("prior_mean", "prior_draw"))
+        require_choice("awareness", awareness, AWARENESS)
         hazard = Hazard() if hazard is None else hazard
         require_kind("hazard", hazard, Hazard, "give a trustbo.hazard.Hazard")
         options = require_options("planner", planner)
@@ -161,6 +167,7 @@ class Campaign(Result):
             sampler=sampler,
             seed=seed,
             initial=initial,
+            awareness=awareness,
             hazard=hazard,
             planner=options,
             fit=fit_options,
@@ -449,8 +456,9 @@ class Campaign(Result):
     def tell(self, mission: Mission, *, again: bool = False) -> xr.DataTree | None:
         """Record a mission and learn from it.
 
-        For learning, the awareness of the map replaces the measured awareness. Robots and features
-        may be in any order, and the path may differ from the planned path.
+        For learning, the awareness of the map replaces the measured awareness, unless the campaign
+        has `awareness="measured"`. Robots and features may be in any order, and the path may differ
+        from the planned path.
 
         Args:
             mission: Measured mission, whether or not it reached the goal.
@@ -485,7 +493,7 @@ class Campaign(Result):
                     f"{plan.path[0]}."
                 )
 
-            learned = as_learned(mission, self.workspace)
+            learned = as_learned(mission, self.workspace, self.state.settings["awareness"])
             row = self.state.row_of(plan, mission)
             entry = Entry(plan, mission, learned, self.trust_map, row)
 

@@ -25,14 +25,26 @@ _RECOVERED = 0.2
 """Failure probability below which such a bound is allowed again."""
 
 
-def as_learned(mission: Mission, workspace: Workspace) -> Mission:
-    """Replace measured awareness with the awareness of the map, which the planner also uses.
+AWARENESS = ("map", "measured")
+"""Sources of awareness from which a campaign learns."""
 
-    Weights fitted to measured awareness would be biased when the planner applies them to the map's
-    awareness. Raises TrustboError if the path leaves the grid or skips cells.
+
+def as_learned(mission: Mission, workspace: Workspace, awareness: str = "map") -> Mission:
+    """Return a mission with the awareness from which a campaign learns.
+
+    Args:
+        mission: Mission with the awareness that was measured, NaN where it was not.
+        workspace: Workspace of the mission.
+        awareness: `"map"` for the awareness of the map, which the planner uses, too; `"measured"`
+            for the measured one. The other source is used where this one is NaN.
+
+    Raises:
+        TrustboError: The path leaves the grid or skips cells.
     """
     known = workspace.along(mission.path, anywhere=True)[: len(mission.bounds)]
-    return mission.with_awareness(np.where(np.isnan(known), mission.awareness, known))
+    measured = mission.awareness
+    first, second = (measured, known) if awareness == "measured" else (known, measured)
+    return mission.with_awareness(np.where(np.isnan(first), second, first))
 
 
 def why_never_learned(mission: Mission) -> str:

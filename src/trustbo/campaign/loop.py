@@ -43,7 +43,7 @@ def iterate(
         overwrite: Whether to replace an existing campaign in that folder.
         progress: Whether to show a progress bar.
         **options: Further arguments of `Campaign`: `model`, `policy`, `objective`, `sampler`,
-            `seed`, `initial`, `hazard`, `planner`, `fit` and `earlier`.
+            `seed`, `initial`, `awareness`, `hazard`, `planner`, `fit` and `earlier`.
 
     Returns:
         Campaign after the last mission, whose properties are the results; a `directory` is closed.

@@ -86,7 +86,8 @@ def read_campaign(
         with interpreting(folder / EARLIER):
             state.earlier = earlier_from_tree(tree)
 
-    entries = _read_entries(folder, workspace, files, len(rows))
+    awareness = state.settings["awareness"]
+    entries = _read_entries(folder, workspace, awareness, files, len(rows))
     for entry, row, name in zip(entries, rows, names, strict=False):
         entry.row = row
         entry.posterior = None if name is None else stored[name]
@@ -96,7 +97,7 @@ def read_campaign(
 
 
 def _read_entries(
-    folder: Path, workspace: Workspace, files: dict[str, str], n_rows: int
+    folder: Path, workspace: Workspace, awareness: str, files: dict[str, str], n_rows: int
 ) -> list[Entry]:
     """Read the missions of a folder, of which campaign.json lists `n_rows`.
 
@@ -120,7 +121,7 @@ def _read_entries(
             planned = tree["planned"].to_dataset()
             plan = plan_from_record(json.loads(planned.attrs["plan"]), workspace)
             row = json.loads(planned.attrs["row"])
-            learned = as_learned(measured, workspace)
+            learned = as_learned(measured, workspace, awareness)
 
         entries.append(Entry(plan, measured, learned, planned["trust_map"], row))
     return entries

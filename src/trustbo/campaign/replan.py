@@ -80,7 +80,7 @@ def follow(
 
         rates = so_far.contact_rate
         n_ticks = so_far.n_ticks
-        z = as_learned(so_far, workspace).awareness
+        z = as_learned(so_far, workspace, result.state.settings["awareness"]).awareness
         closed += failed_bounds(so_far)
 
         if cell != path[-1]:

@@ -15,7 +15,7 @@ from trustbo.planning import Planner
 from trustbo.planning.policies import Policy
 from trustbo.workspace import Workspace
 
-_UNCHANGED = ("objective", "sampler", "seed", "initial", "planner", "fit")
+_UNCHANGED = ("objective", "sampler", "seed", "initial", "awareness", "planner", "fit")
 """Arguments of `Campaign` that are stored unchanged."""
 _FIT = inspect.signature(fit)
 
@@ -42,6 +42,7 @@ def to_settings(
     sampler: str,
     seed: int,
     initial: str,
+    awareness: str,
     hazard: Hazard,
     planner: dict[str, Any],
     fit: dict[str, Any],
@@ -56,6 +57,7 @@ def to_settings(
         sampler: Sampler of the posterior.
         seed: Seed of all random numbers.
         initial: Parameters for the first plan.
+        awareness: Awareness from which the model learns.
         hazard: Priors of the failure probabilities.
         planner: Further options of the planner.
         fit: Further options of `fit`.
@@ -76,6 +78,7 @@ def to_settings(
         "sampler": sampler,
         "seed": require_whole("seed", seed, 0),
         "initial": initial,
+        "awareness": awareness,
         "planner": to_plain("planner", planner),
         "fit": to_plain("fit", fit),
         "hazard": asdict(hazard),

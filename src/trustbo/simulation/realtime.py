@@ -9,11 +9,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from trustbo.data import Bound, Mission
-from trustbo.errors import TrustboError
+from trustbo.data import Bound, Cell, Mission
+from trustbo.errors import TrustboError, require_kind, require_list, require_whole
 from trustbo.simulation.kinematic import KinematicSimulator
+from trustbo.simulation.protocol import DescribedSimulator, digest
 from trustbo.simulation.world import World
 from trustbo.terrain import CompositeIndex
+from trustbo.workspace.moves import MOVES
 from trustbo.workspace.sight import detection_between, optics
 
 SIGNS = {
@@ -23,26 +25,70 @@ SIGNS = {
 """Inputs of each feature, with the signs of their effects; pitch is in rad, range in m."""
 MIN_SAMPLES = 200
 """Smallest number of samples (robots x bounds); loadings from fewer samples are unstable."""
+_MOST_BOUNDS = 10
+"""Largest number of bounds of a random walk."""
+_MOST_WALKS = 1000
+"""Largest number of random walks for calibration."""
 _SHARES = np.array([0.25, 0.5, 0.75, 1.0])
 """Points along a beam, as shares of its reach, up to which sight is computed."""
 _ANGLES = np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
 """Directions of the twelve beams of a lidar, rad from east, anticlockwise."""
 
 
-class RealtimeAwareness:
-    """Awareness measured by the robots during a bound.
+class RealtimeAwareness(DescribedSimulator):
+    """Simulator whose missions contain the awareness that the robots measured in each bound.
+
+    It runs missions in a `KinematicSimulator`, and replaces traversability and visibility by the
+    first principal component of the map and of what the robots measured: speed, pitch and roll, and
+    the range and the share of clear beams of a lidar. Other features remain those of the map. A
+    campaign learns from measured awareness with `awareness="measured"`.
 
     Attributes:
-        indices: Fitted `CompositeIndex` of each feature.
+        simulator: Simulator of the missions; use this one for `Truth.from_simulator`.
+        workspace: Workspace of the simulator.
+        indices: Fitted `CompositeIndex` of each feature, keyed by its name.
+
+    Example:
+        >>> robots = tb.simulation.RealtimeAwareness(tb.simulation.KinematicSimulator(workspace))
+        >>> tb.iterate(workspace, (9, 0), (0, 9), simulator=robots, awareness="measured")
     """
 
-    def __init__(self, simulator: KinematicSimulator, missions: Sequence[Mission]) -> None:
-        """Fit the indices to calibration missions; raises TrustboError if there are too few."""
-        self._workspace = simulator.workspace
-        self._world = simulator.world()
-        self._tick = simulator.tick
+    def __init__(
+        self,
+        simulator: KinematicSimulator,
+        missions: Sequence[Mission] | None = None,
+        *,
+        seed: int = 0,
+    ) -> None:
+        """Fit the indices to calibration missions.
+
+        Args:
+            simulator: Simulator of the missions.
+            missions: Missions of this simulator, with poses; by default, missions on random paths.
+            seed: Seed of the random paths.
+
+        Raises:
+            TrustboError: The workspace lacks a feature of `SIGNS`, or there are fewer than 200
+                samples (robots x bounds), or a bound has no poses.
+        """
+        remedy = "give a trustbo.simulation.KinematicSimulator"
+        self.simulator = require_kind("simulator", simulator, KinematicSimulator, remedy)
+        self.workspace = simulator.workspace
+        missing = [feature for feature in SIGNS if feature not in self.workspace.features]
+        if missing or self.workspace.pixels is None:
+            raise TrustboError(
+                f"real-time awareness needs the features {', '.join(SIGNS)} of a terrain; the "
+                f"workspace has {', '.join(self.workspace.features)}."
+            )
+
+        if missions is None:
+            missions = _random_missions(simulator, require_whole("seed", seed, 0))
+        else:
+            remedy = "give a list of missions"
+            missions = require_list("missions", missions, Mission, remedy)
+
         samples = [self.inputs(bound) for mission in missions for bound in mission.bounds]
-        n = len(samples) * self._world.team.n_robots
+        n = len(samples) * self.workspace.team.n_robots
         if n < MIN_SAMPLES:
             raise TrustboError(
                 f"real-time awareness needs {MIN_SAMPLES} samples (robots x bounds); got {n}. Give "
@@ -57,14 +103,41 @@ class RealtimeAwareness:
             }
             self.indices[feature] = CompositeIndex(signs).fit(inputs)
 
-    def inputs(self, bound: Bound) -> dict[str, dict[str, np.ndarray]]:
-        """Compute the inputs of each feature (see `SIGNS`), each of shape (robot,)."""
-        world = self._world
-        workspace = self._workspace
-        poses = bound.poses[:, 1:]  # pyright: ignore[reportOptionalSubscript]
+    def describe(self) -> dict[str, object]:
+        """Return the settings that affect the measurements of a mission."""
+        fitted = [self.indices[feature].fitted for feature in SIGNS]
+        numbers = [one[name].values for one in fitted for name in ("loading", "low", "high")]
+        return {**self.simulator.describe(), "realtime_awareness": digest(*numbers)}
+
+    def describe_world(self, mission: int) -> dict[str, object]:
+        """Return the settings of a mission's world, which are equal for equal worlds."""
+        return self.simulator.describe_world(mission)
+
+    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
+        """Run a path and measure awareness; see `KinematicSimulator.run`."""
+        return self.measured(self.simulator.run(path, seed=seed, mission=mission), number=mission)
+
+    def inputs(self, bound: Bound, *, number: int = 0) -> dict[str, dict[str, np.ndarray]]:
+        """Compute the inputs of each feature (see `SIGNS`), each of shape (robot,).
+
+        Args:
+            bound: Bound with poses.
+            number: Number of the mission, from 0, which determines the active events.
+
+        Raises:
+            TrustboError: The bound has no poses.
+        """
+        if bound.poses is None:
+            raise TrustboError(
+                f"the bound into {bound.cell} has no poses, from which awareness is measured."
+            )
+
+        world = self.simulator.world(number)
+        workspace = self.workspace
+        poses = bound.poses[:, 1:]
 
         way = np.diff(poses[..., :2], axis=0, prepend=poses[:1, :, :2])
-        speed = np.hypot(way[..., 0], way[..., 1]) / self._tick
+        speed = np.hypot(way[..., 0], way[..., 1]) / self.simulator.tick
         gx, gy = world.surface.gradient[:, *world.surface.nearest(poses[..., 0], poses[..., 1])]
 
         ahead = np.cos(poses[..., 2])
@@ -85,14 +158,52 @@ class RealtimeAwareness:
             found[feature] = {n: (ticks[n] * moved).sum(0) / moved.sum(0) for n in signs}
         return found
 
-    def measured(self, mission: Mission) -> Mission:
-        """Return the mission with the features of `SIGNS` as measured by the robots."""
+    def measured(self, mission: Mission, *, number: int = 0) -> Mission:
+        """Return a mission with the features of `SIGNS` as measured by the robots.
+
+        Args:
+            mission: Mission of the simulator, with poses.
+            number: Number of the mission, from 0, which determines the active events.
+
+        Raises:
+            TrustboError: A bound has no poses.
+        """
         z = mission.awareness.copy()
         for k, bound in enumerate(mission.bounds):
-            for feature, inputs in self.inputs(bound).items():
+            for feature, inputs in self.inputs(bound, number=number).items():
                 column = mission.features.index(feature)
                 z[k, :, column] = self.indices[feature].transform(inputs)
         return mission.with_awareness(z)
+
+
+def _random_missions(simulator: KinematicSimulator, seed: int) -> list[Mission]:
+    """Run missions on random paths without loops, until there are enough samples."""
+    rng = np.random.default_rng(seed)
+    bounds = simulator.workspace.passable_bounds.values
+    n_needed = -(-MIN_SAMPLES // simulator.team.n_robots)
+
+    onward: dict[Cell, list[Cell]] = {}
+    for move, row, col in np.argwhere(bounds).tolist():
+        down, right = MOVES[move]
+        onward.setdefault((row - down, col - right), []).append((row, col))
+    starts = sorted(onward)
+
+    missions = []
+    n_bounds = 0
+    for n in range(_MOST_WALKS if starts else 0):
+        path = [starts[rng.integers(len(starts))]]
+        while len(path) <= _MOST_BOUNDS:
+            new = [cell for cell in onward[path[-1]] if cell not in path and cell in onward]
+            if not new:
+                break
+            path.append(new[rng.integers(len(new))])
+
+        if len(path) > 1:
+            missions.append(simulator.run(path, seed=seed + n))
+            n_bounds += len(missions[-1].bounds)
+        if n_bounds >= n_needed:
+            break
+    return missions
 
 
 def lidar_state(world: World, poses: np.ndarray) -> dict[str, np.ndarray]:
