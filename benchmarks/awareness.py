@@ -27,7 +27,7 @@ from scipy import stats
 
 import trustbo as tb
 from trustbo.data import Cell
-from trustbo.models import PooledTrust, TrustParams, default_model
+from trustbo.models import TrustParams, default_model
 from trustbo.planning.policies import random
 from trustbo.study import worlds
 from trustbo.study.world import COURSES, World
@@ -35,26 +35,29 @@ from trustbo.study.world import COURSES, World
 N_MISSIONS = 8
 PAPER = "paper's terrain"
 MODELS = {
-    "equations (3)-(4), cells": (PooledTrust(), tb.paper.WORKSPACE, (2, 4, 7)),
-    "default, bounds": (default_model(), {}, (4,)),
+    "cells": ("paper's model, cells", tb.paper.CAMPAIGN["model"], tb.paper.WORKSPACE, (2, 4, 7)),
+    "bounds": ("default model, bounds", default_model(), {}, (4,)),
 }
-"""Models, keyed by name, with the options of the workspace and the numbers of missions fitted."""
+"""Title, model, options of the workspace, and numbers of missions after which it is fitted."""
 RIVALS = ("map", "measured", "measured, also ahead")
 
 
 def main():
-    parser = arguments(__doc__, data=True, n=20, out="out/awareness", quick="two worlds")
+    parser = arguments(
+        __doc__, data=True, names=MODELS, n=20, out="out/awareness", quick="two worlds"
+    )
     given = parsed(parser)
     n = 2 if given.quick else given.n
     given.out.mkdir(parents=True, exist_ok=True)
-    for name, (model, options, after) in MODELS.items():
+    for name in given.names:
+        title, model, options, after = MODELS[name]
         rows = []
         for label, make, seed in scenes(given.data, n, options):
-            file = given.out / f"{name}-{label}-{seed}.csv".replace(" ", "_")
+            file = given.out / f"{name}-{label}-{seed}.csv"
             if not file.exists():
                 compare(*make(), model, after, seed).to_csv(file, index=False)
             rows.append(pd.read_csv(file).assign(world=label, seed=seed))
-        report(name, pd.concat(rows))
+        report(title, pd.concat(rows))
 
 
 def scenes(data: Path | None, n: int, options: dict[str, Any]) -> Iterator[tuple[str, Any, int]]:
@@ -126,14 +129,14 @@ def compare(
     return pd.DataFrame(rows)
 
 
-def report(name: str, rows: pd.DataFrame) -> None:
+def report(title: str, rows: pd.DataFrame) -> None:
     """Print the mean log score of each source, and its difference from the map's."""
     for what, some in (
         ("worlds", rows[rows["world"] != PAPER]),
         (PAPER, rows[rows["world"] == PAPER]),
     ):
         by = some.groupby(["world", "seed", "awareness"])["mean_log_score"].mean().unstack()
-        print(f"\n**{name}**, {what} ({len(by)} pairs)\n")
+        print(f"\n**{title}**, {what} ({len(by)} pairs)\n")
         print("| awareness | log score per rate, nats | minus the map's [95 %] | worlds better |")
         print("| --- | --- | --- | --- |")
         for rival in RIVALS:
