@@ -236,6 +236,15 @@ def test_what_cannot_be_replanned_leaves_the_plan_as_it_was(tmp_path):
     assert campaign.ask() is asked
 
 
+def test_a_mission_without_the_way_back_is_refused():
+    campaign = begun()
+    jump = mission([(3, 0), (2, 1), (1, 2), (3, 1), (2, 2), (1, 3), (0, 3)], rates_of(6),
+                   ["ok", "stuck", *["ok"] * 4])  # fmt: skip
+    with pytest.raises(TrustboError, match="back"):
+        campaign.tell(jump)
+    assert len(campaign.missions) == 1
+
+
 def test_the_limit_on_bounds_is_that_of_the_whole_mission():
     planner = Planner(random_cells(), *ENDS, max_bounds=5)
     assert planner.from_cell((2, 1), n_driven=1).problem.paths.longest == 4

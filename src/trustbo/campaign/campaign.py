@@ -383,8 +383,8 @@ class Campaign(Result):
 
         Raises:
             TrustboError: The mission does not start where the plan starts or does not end in
-                `cell`, `cell` is the goal, or the plan cannot be recorded. `ask` then returns the
-                same plan as before, as after the next error.
+                `cell`, `cell` is the goal, or the plan cannot be recorded. After an error, `ask`
+                returns the same plan as before.
             NoPathError: The goal cannot be reached any more.
 
         Example:

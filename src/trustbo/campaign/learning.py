@@ -41,7 +41,16 @@ def as_learned(mission: Mission, workspace: Workspace, awareness: str = "map") -
     Raises:
         TrustboError: The path leaves the grid or skips cells.
     """
-    known = workspace.along(mission.path, anywhere=True)[: len(mission.bounds)]
+    try:
+        known = workspace.along(mission.path, anywhere=True)[: len(mission.bounds)]
+    except TrustboError as error:
+        if any(bound.status != "ok" for bound in mission.bounds[:-1]):
+            raise TrustboError(
+                f"{error} A lead that did not reach the cell of a bound that failed has to drive a "
+                "bound back before the next one."
+            ) from None
+        raise
+
     measured = mission.awareness
     first, second = (measured, known) if awareness == "measured" else (known, measured)
     return mission.with_awareness(np.where(np.isnan(first), second, first))
