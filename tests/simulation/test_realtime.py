@@ -136,6 +136,21 @@ def test_a_campaign_learns_from_the_awareness_of_its_choice(simulator, missions,
     assert resumed.planner.workspace is resumed.workspace
 
 
+@pytest.mark.filterwarnings("ignore:the first component of", "ignore:.*enters its composite")
+@pytest.mark.filterwarnings("ignore:the loading of")
+def test_without_a_simulator_robots_measure_if_the_model_learns_from_it(simulator, tmp_path):
+    workspace = simulator.workspace
+    options = {"model": tb.models.PooledTrust(), "sampler": "importance", "fit": {"draws": 100},
+               "progress": False, "awareness": "measured"}  # fmt: skip
+    tb.iterate(workspace, (2, 0), (0, 2), n_iterations=1, directory=tmp_path / "one", **options)
+    result = tb.resume(tmp_path / "one", n_iterations=2, progress=False)
+    assert len(result.missions) == 2
+    for entry in result.state.entries:
+        known = workspace.along(entry.plan.path)
+        assert not np.allclose(entry.measured.awareness[..., :2], known[..., :2])
+        np.testing.assert_array_equal(entry.measured.awareness, entry.mission.awareness)
+
+
 def test_the_map_fills_what_was_not_measured():
     z = np.random.default_rng(0).uniform(size=(3, 4, 4, 2))
     workspace = tb.Workspace.from_awareness(z)

@@ -53,7 +53,7 @@ from trustbo.inference.learner import Model, learner_from_record, learner_of
 from trustbo.models.draws import Draws
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.policies import POLICIES, Policy, resolve_policy
-from trustbo.simulation import KinematicSimulator
+from trustbo.simulation import KinematicSimulator, RealtimeAwareness
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -638,7 +638,7 @@ class Campaign(Result):
             TrustboError: The input is invalid; raised before any work starts.
         """
         require_whole("n_iterations", n_iterations, 1)
-        runner = KinematicSimulator(self.workspace) if simulator is None else simulator
+        runner = self._usual_simulator() if simulator is None else simulator
         if isinstance(runner, type) or not callable(getattr(runner, "run", None)):
             raise TrustboError(
                 f"simulator needs a method run(path, *, seed, mission) -> Mission; got {runner!r}."
@@ -652,6 +652,13 @@ class Campaign(Result):
             self.state.simulation = json.loads(to_json(settings))
             self._progress = progress
         return self._run(runner, n_iterations, stop)
+
+    def _usual_simulator(self) -> Simulator:
+        """Make the default simulator, in which robots measure awareness if it is learned from."""
+        simulator = KinematicSimulator(self.workspace)
+        if self.state.settings["awareness"] == "measured":
+            return RealtimeAwareness(simulator)
+        return simulator
 
     def _run(
         self, simulator: Simulator, n_iterations: int, stop: Stop | None

@@ -35,7 +35,7 @@ def iterate(
         goal: Last cell, or a position in this cell.
         n_iterations: Maximum number of missions.
         simulator: Simulator with `run(path, *, seed, mission) -> Mission`; by default
-            `KinematicSimulator(workspace)`.
+            `KinematicSimulator(workspace)`, or `RealtimeAwareness` of it if `awareness="measured"`.
         stop: Stopping rule, called between missions: a `RegretBound`, or a function of the campaign
             that returns a reason or None.
         directory: Folder that is updated after each mission. If the process dies, `resume`
