@@ -174,7 +174,7 @@ def print_price():
 def chances(risk, path):
     """Compute the failure probability of a path from means, components, and 20 000 draws."""
     risks = Risk(risk.mean), Risk(risk.mean, components=risk.components())
-    joint = [one.priced(path) for one in risks]
+    joint = [one.failure(path) for one in risks]
     rows, cols = np.array(path[1:]).T
     drawn = risk.draw(20_000, seed=1)[:, moves_along(path), rows, cols]
     return [f"{p:.3f}" for p in (*joint, 1.0 - np.prod(1.0 - drawn, axis=1).mean())]

@@ -111,7 +111,7 @@ def draw_risk(rng, shape, of_contact):
         options["max_failure"] = float(-np.expm1(-rng.exponential(0.5)))
     if of_contact and rng.random() < 0.6:
         options["failure_cost"] = float(pick(rng, 0.0, 0.7, 3.0, 40.0))
-    if of_contact and rng.random() < 0.6:
+    if rng.random() < 0.6:
         n = int(rng.integers(2, 6))
         severity = np.sort(rng.lognormal(0.0, pick(rng, 0.3, 1.5), n))[:, None, None, None]
         noise = rng.lognormal(0.0, pick(rng, 0.0, 0.0, 1.0), (n, *shape))
@@ -122,15 +122,12 @@ def draw_risk(rng, shape, of_contact):
     return p, components, options
 
 
-def risks_of(p, components, cost):
-    """Return risks (sum, move, cell) of each component and, last, of the mean, and their costs."""
-    some, failure = p[None], np.array([cost])
-    if components is not None and cost > 0.0:
-        some = np.concatenate([components.p_fail, p[None]])
-        failure = np.append(cost * components.weights, 0.0)
+def risks_of(p, components):
+    """Return risks (sum, move, cell) of each component and their shares; of the mean without."""
+    some, share = (p[None], np.ones(1)) if components is None else components
     with np.errstate(divide="ignore"):
         risk = np.minimum(-np.log1p(-some), 700.0)
-    return risk.reshape(len(some), 8, -1), failure
+    return risk.reshape(len(some), 8, -1), share
 
 
 def draw_problem(rng):
@@ -162,15 +159,16 @@ def draw_problem(rng):
     )  # fmt: skip
     if closed.any():
         planner = planner.avoiding(closed, np.zeros(closed.shape))
-    risk, failure = np.zeros((1, 8, passable.size)), np.zeros(1)
+    risk, share, failure = np.zeros((1, 8, passable.size)), np.ones(1), np.zeros(1)
     if p is not None:
         planner = planner.with_risk(p, None, components)
         cost = options.get("failure_cost", float(shortest)) if objective == "lost_contact" else 0.0
-        risk, failure = risks_of(p, components, cost)
-    limit = -np.log1p(-options["max_failure"]) if "max_failure" in options else np.inf
+        risk, share = risks_of(p, components)
+        failure = cost * share
+    limit = options.get("max_failure", np.inf)
     return planner, params, World(
         objective, *ends, into, bound_cost.reshape(8, -1), u, B0, x0, family, sd, shortest + extra,
-        turns, risk, failure, limit,
+        turns, risk, failure, share, limit,
     )  # fmt: skip
 
 

@@ -29,9 +29,10 @@ class World(NamedTuple):
     sd: float
     longest: int
     turns: bool
-    risk: np.ndarray  # (sum, move, cell entered), -log(1 - p), the last one's limited
+    risk: np.ndarray  # (sum, move, cell entered), -log(1 - p)
     failure: np.ndarray  # (sum,), cost of failing by each sum
-    limit: float
+    share: np.ndarray  # (sum,), probability of each sum
+    limit: float  # on the probability to fail
 
     def loss(self, trust):
         """Contact lost in a bound, or what its trust takes from a sum."""
@@ -68,7 +69,7 @@ def to_goal(into, goal):
 
 
 def best_walk(world, most):
-    """Best score within the limit, -inf without such a walk, and the least limited sum.
+    """Best score within the limit, -inf without such a walk, and the least probability to fail.
 
     TooManyError: more than `most` walks. NaN if rounding decides which are within the limit.
     """
@@ -92,7 +93,7 @@ def best_walk(world, most):
         risk = risk[:, walk] + world.risk[:, m, other]
         cell, came, there = other, m, other == world.goal
         scores.append(world.score(cost, last, bound_cost, risk, k)[there])
-        sums.append(risk[-1, there])
+        sums.append(-np.tensordot(world.share, np.expm1(-risk[:, there]), 1))
         on = ~there
         cell, came, x, risk = cell[on], came[on], x[:, on], risk[:, on]
         cost, bound_cost = cost[on], bound_cost[on]
@@ -115,6 +116,6 @@ def score_along(world, path):
         x = world.B0 @ x + world.u[:, came, c]
         costs.append(world.loss(x.mean()))
         risk, bound_cost = risk + world.risk[:, came, c], bound_cost + world.bound_cost[came, c]
-    if len(costs) > world.longest or risk[-1] > world.limit:
+    if len(costs) > world.longest or -world.share @ np.expm1(-risk) > world.limit:
         return -np.inf
     return world.score(sum(costs), costs[-1], bound_cost, risk, len(costs))

@@ -61,9 +61,10 @@ def test_few_strata_have_the_chance_to_fail_that_all_draws_have(risk):
     """Against 10 000 draws of the chances themselves; the product of means is far above."""
     risk, path = risk
     planner_risks = [tb.hazard.risk.Risk(risk.mean, components=risk.components(n)) for n in (1, 5)]
-    product, five = (of_path.priced(path) for of_path in planner_risks)
+    product, five = (of_path.failure(path) for of_path in planner_risks)
     rows, cols = np.array(path[1:]).T
     drawn = 1.0 - np.prod(1.0 - risk.draw(10_000, seed=1)[:, 2, rows, cols], axis=1)
     assert abs(five - drawn.mean()) < 0.02
     assert product > drawn.mean() + 0.04
-    np.testing.assert_allclose(product, 1.0 - planner_risks[0].survival(path), rtol=1e-9)
+    of_bounds = planner_risks[0].along(path).p_fail
+    np.testing.assert_allclose(product, 1.0 - np.prod(1.0 - of_bounds), rtol=1e-9)

@@ -141,7 +141,7 @@ def test_the_graph_of_bounds_is_for_any_algorithm_of_networkx(workspace):
     assert graph.nodes[4, 0] == {"x": 10.0, "y": 10.0}
     assert graph.edges[(4, 0), (3, 1)]["length"] == pytest.approx(20.0 * np.sqrt(2.0))
     risk = nx.path_weight(graph, plan.path, "risk")
-    assert np.exp(-risk) == pytest.approx(planner.problem.risk.survival(plan.path), rel=1e-12)
+    assert np.exp(-risk) == pytest.approx(1.0 - planner.problem.risk.failure(plan.path), rel=1e-12)
     edge = graph.edges[plan.path[:2]]
     assert edge["trust"] == pytest.approx(edge["drift"] / 0.4)
     assert edge["lost"] == pytest.approx(max(0.0, 1.0 - edge["trust"]) + 0.01)

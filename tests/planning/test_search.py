@@ -17,6 +17,7 @@ from trustbo.models import ContactRate, TrustParams
 from trustbo.planning import OBJECTIVES, InfeasibleError, Planner, reference
 from trustbo.planning.objectives import Objective
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import bounds_along
 
 PARAMS = TrustParams(0.6, np.array([0.8, 0.4]), -0.3, 0.1, 0.1)
 ENDS = (3, 0), (0, 3)
@@ -161,15 +162,49 @@ def test_an_infeasible_limit_is_an_error_with_the_safest_path(workspace):
     p = np.random.default_rng(2).uniform(0.05, 0.3, (8, 4, 4))
     planner = Planner(workspace, *ENDS, max_failure=0.1).with_risk(p)
     risk = planner.problem.risk
-    survival = {path: risk.survival(path) for path in paths_of(planner)}
+    failure = {path: risk.failure(path) for path in paths_of(planner)}
     with pytest.raises(InfeasibleError, match="max_failure") as error:
         planner.plan(PARAMS)
-    assert error.value.path == max(survival, key=survival.get)
-    assert error.value.p_fail == pytest.approx(1.0 - max(survival.values()), rel=1e-9)
+    assert error.value.path == min(failure, key=failure.get)
+    assert error.value.p_fail == pytest.approx(min(failure.values()), rel=1e-9)
     assert planner.evaluate(error.value.path, PARAMS).infeasible
     assert planner.maps(PARAMS.flat())["path_probability"].sum() == len(error.value.path)
     with pytest.raises(TrustboError, match="max_failure"):
         Planner(workspace, *ENDS, max_failure=0.1).plan(PARAMS)  # without a risk
+
+
+@pytest.mark.parametrize("objective", ["lost_contact", "terminal"])
+def test_the_limit_holds_for_bounds_that_fail_together(workspace, objective):
+    """The failure probability is averaged over components, by enumeration of all paths."""
+    rng = np.random.default_rng(4)
+    paths = paths_of(Planner(workspace, *ENDS, objective))
+    refused = 0
+    changed = 0
+
+    for _ in range(60):
+        weights = rng.dirichlet(np.ones(3))
+        severity = rng.uniform(0.0, 1.0, (3, 1, 1, 1))
+        p = severity * rng.uniform(0.0, 0.6, (3, 8, 4, 4))
+        limit = rng.uniform(0.1, 0.6)
+        planner = Planner(workspace, *ENDS, objective, max_failure=limit)
+        planner = planner.with_risk(np.tensordot(weights, p, 1), None, Components(p, weights))
+
+        index = [(slice(None), *bounds_along(path).T) for path in paths]
+        failure = np.array([weights @ (1.0 - np.prod(1.0 - p[i], axis=1)) for i in index])
+        values = np.array([planner.evaluate(path, PARAMS).value for path in paths])
+        if failure.min() > limit:
+            refused += 1
+            with pytest.raises(InfeasibleError) as error:
+                planner.plan(PARAMS)
+            assert error.value.path == paths[failure.argmin()]
+            assert error.value.p_fail == pytest.approx(failure.min(), rel=1e-9)
+            continue
+
+        allowed = np.where(failure <= limit, values, -np.inf)
+        changed += values.argmax() != allowed.argmax()
+        assert planner.plan(PARAMS).value == pytest.approx(allowed.max(), rel=1e-9)
+    assert refused > 1
+    assert changed > 1
 
 
 def test_a_search_that_is_cut_short_keeps_the_limit_and_says_what_could_be_better(monkeypatch):

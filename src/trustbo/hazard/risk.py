@@ -190,8 +190,8 @@ class Risk:
         p_fail: Posterior mean, shape (move, row, col), with moves as in `MOVES`; NaN where there
             is no bound.
         draws: Posterior draws, shape (draw, move, row, col), or None.
-        components: Mean failure probabilities of groups of draws, used for the expected cost of
-            failure. If None, bounds are assumed to fail independently with probability `p_fail`.
+        components: Mean failure probabilities of groups of draws, used for the failure probability
+            of a path. If None, bounds are assumed to fail independently with probability `p_fail`.
 
     Raises:
         TrustboError: If the shapes do not match, or a probability is outside [0, 1].
@@ -213,20 +213,17 @@ class Risk:
             if bad.any():
                 raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")
 
-    def survival(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Compute the product of 1 - p_fail along a path, which is used to check `max_failure`.
+    def failure(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """Compute the failure probability of a path, for `failure_cost` and `max_failure`.
 
-        The arrival probability is larger if failures are correlated (see `along`).
+        It is averaged over the components, since failures of bounds are correlated.
         """
-        return float(np.prod(1.0 - self.p_fail[*bounds_along(path).T]))
-
-    def priced(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Average the failure probability of a path over components, for `failure_cost`."""
+        index = tuple(bounds_along(path).T)
         if self.components is None:
-            return 1.0 - self.survival(path)
+            return float(1.0 - np.prod(1.0 - self.p_fail[index]))
+
         p_fail, weights = self.components
-        p = p_fail[:, *bounds_along(path).T]
-        return float(weights @ (1.0 - np.prod(1.0 - p, axis=1)))
+        return float(weights @ (1.0 - np.prod(1.0 - p_fail[:, *index], axis=1)))
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
         """Compute the risk along a path."""

@@ -4,7 +4,8 @@ The method is a label-setting algorithm with dominance for the resource-constrai
 (Martins 1984; Irnich and Desaulniers 2005). A label at a state contains the cost so far, the sums
 r_m of the risks -log(1 - p) and, if the loss depends on trust, trust. An edge has a cost and
 possibly a loss, which decreases with trust. The cost of a path also includes
-sum_m F_m (1 - exp(-r_m)), and the last sum must not exceed a limit.
+sum_m F_m (1 - exp(-r_m)), and its failure probability sum_m w_m (1 - exp(-r_m)) must not exceed a
+limit.
 
 A label is dropped if another label of its state has no higher cost, no larger sums and no lower
 trust. Because B0 >= 0 preserves the order of trust, any path to the goal is at least as good from
@@ -12,8 +13,9 @@ the other label. If U-turns are forbidden, the other label must come from the sa
 must be two such labels from different cells. A label is also dropped if no path that continues it
 can be better than the best path found so far. To check this, the remaining cost is bounded from
 below by a sum over edges, which uses the largest possible trust and the chord of
-F_m (1 - exp(-r_m)) over the sums that can still be optimal. The limit is relaxed with a Lagrange
-multiplier, found by bisection (Handler and Zang 1980).
+F_m (1 - exp(-r_m)) over the sums that can still be optimal. The limit, with the chord of
+w_m (1 - exp(-r_m)), is relaxed with a Lagrange multiplier, found by bisection (Handler and Zang
+1980).
 
 The search is exact because no dropped label can lead to a better path than the one returned.
 """
@@ -41,7 +43,7 @@ TINY_SD = 1e-9
 _N_MOVES = len(MOVES)  # largest number of labels that extend one label
 _MAX_EXPONENT = 700.0  # exp(710) exceeds the range of a float
 _N_TANGENTS = 8  # most tangents to the failure cost; few are needed to find good paths
-_N_PRICES = 16  # most prices of the limited sum for which the dual is computed
+_N_PRICES = 16  # most prices of the limit for which the dual is computed
 _PRICE_TOLERANCE = 1e-9  # relative change below which the tangents have converged
 _NO_CELL_YET = -2  # differs from all cells and from -1, the cell before the start
 
@@ -53,8 +55,8 @@ class Costs(NamedTuple):
     (n_bounds_left, robot) times `drift` (robot, bound). `start` (n_bounds_left,) is the constant
     cost of paths with a given number of bounds. `transition` (robot, robot) and `x0` (robot,)
     define the recursion for trust, or are empty if there is no loss. `sd` is the sd of a rate.
-    `risk` has the shape (bound, sum), `failure` (sum,) contains F_m, and `limit` is the largest
-    value allowed for the last sum.
+    `risk` has the shape (bound, sum), `failure` (sum,) contains F_m, `share` (sum,) contains w_m,
+    and `limit` is the largest failure probability allowed.
     """
 
     loss: int
@@ -67,6 +69,7 @@ class Costs(NamedTuple):
     bound_cost: np.ndarray
     risk: np.ndarray
     failure: np.ndarray
+    share: np.ndarray
     limit: float
 
 
@@ -111,10 +114,11 @@ def best_labels(
 @kernel
 def _best_labels(graph, costs, max_labels, cost, lower, paths, begin, end):
     """Write the results of `_best_path` for the draws from `begin` to `end`."""
-    loss, drift, weight, start, transition, x0, sd, bound_cost, risk, failure, limit = costs
+    loss, drift, weight, start, transition, x0, sd, bound_cost, risk, failure, share, limit = costs
+    failing = bound_cost, risk, failure, share, limit
     for d in range(begin, end):
         trust = transition[d], x0[d], sd[d]
-        one = Costs(loss, drift[d], weight[d], start[d], *trust, bound_cost, risk, failure, limit)
+        one = Costs(loss, drift[d], weight[d], start[d], *trust, *failing)
         cost[d], lower[d] = _best_path(graph, one, max_labels, paths[d])
 
 
@@ -174,12 +178,21 @@ def _least_costs(graph, costs, edge_cost):
 
 
 @kernel
-def _failing(failure, r):
-    """Compute the expected cost of failure, given the sums r of the risks, shape (sum,)."""
+def _failing(weights, r):
+    """Compute sum_m weights_m (1 - exp(-r_m)) for the sums r of the risks, shape (sum,).
+
+    This is the expected cost of failure if the weights are F_m, or its probability if they are w_m.
+    """
     total = 0.0
     for m in range(len(r)):
-        total -= failure[m] * math.expm1(-r[m])
+        total -= weights[m] * math.expm1(-r[m])
     return total
+
+
+@kernel
+def _is_beyond(costs, r):
+    """Check whether the failure probability for the sums r exceeds the limit."""
+    return costs.limit < np.inf and _failing(costs.share, r) > costs.limit
 
 
 class Known(NamedTuple):
@@ -222,7 +235,7 @@ def _try_paths(graph, costs, edge_cost, to_go, known):
             sums += costs.risk[graph.bound[e]]
         cost += _failing(costs.failure, sums)
 
-        if sums[-1] <= costs.limit and cost < known.cost[0]:
+        if cost < known.cost[0] and not _is_beyond(costs, sums):
             known.cost[0] = cost
             known.edges[:] = -1
             known.edges[:n] = known.trial[:n]
@@ -269,77 +282,114 @@ def _limits(graph, costs, edge_cost, least_cost, known):
     safest = np.empty((len(graph.cell), n_sums))
     low = np.empty(n_sums)
 
+    nothing = np.zeros(len(graph.head))
     for m in range(n_sums):
-        _fill_priced(graph, costs, np.zeros(len(graph.head)), np.eye(n_sums)[m], to_go)
+        _fill_priced(graph, costs, nothing, np.eye(n_sums)[m], to_go)
         safest[:, m] = to_go.least
         low[m] = to_go.least[graph.starts].min()
-    _try_paths(graph, costs, edge_cost, to_go, known)  # safest with respect to the limited sum
+
+    if _is_beyond(costs, low):  # even if one path had all the smallest sums
+        unknown = np.full(len(graph.cell), np.inf)
+        return Limits(np.inf, safest, unknown, unknown, np.zeros(n_sums), 0.0)
+    if costs.limit < np.inf:
+        _follow_tangents(graph, costs, edge_cost, nothing, costs.share, low, to_go, known)
 
     fill_to_go(graph, least_cost, to_go)
     free = to_go.least.copy()
     least = _try_paths(graph, costs, edge_cost, to_go, known)
-    if known.cost[0] == np.inf:
-        return Limits(np.inf, safest, free, free, np.zeros(n_sums), 0.0)
+    sums = known.sums.copy()
+    _follow_tangents(graph, costs, edge_cost, least_cost, costs.failure, sums, to_go, known)
 
-    price = np.zeros(n_sums)
-    for _ in range(_N_TANGENTS):  # tangents to the concave failure cost give good paths
-        before = price
-        price = costs.failure * np.exp(-known.sums)
-        if np.abs(price - before).max() <= _PRICE_TOLERANCE * costs.failure.max():
-            break
-        _fill_priced(graph, costs, least_cost, price, to_go)
-        _try_paths(graph, costs, edge_cost, to_go, known)
+    # With chords as prices, a sum over edges bounds the cost from below (see the module).
+    gap = known.cost[0] - least
+    high = np.minimum(_highest(costs.failure, low, gap), _highest(costs.share, low, costs.limit))
+    chord, offset = _chords(costs.failure, low, high)
+    slope, at_zero = _chords(costs.share, low, high)
 
-    # With the chord as prices, a sum over edges bounds the cost from below (see the module).
-    chord, offset = _chords(costs, low, known.cost[0] - least)
-    lower, extra = _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, known)
-    chord[-1] += extra
-    _fill_priced(graph, costs, least_cost, chord, to_go)
+    relaxed = Relaxed(chord, offset, slope, at_zero)
+    lower, extra = _price_of_limit(graph, costs, edge_cost, least_cost, relaxed, to_go, known)
+    price = chord + extra * slope
+    _fill_priced(graph, costs, least_cost, price, to_go)
     if extra > 0.0:  # otherwise, the limit may be inf, and 0 times inf is NaN
-        offset -= extra * costs.limit
+        offset += extra * (at_zero - costs.limit)
 
-    return Limits(lower, safest, free, to_go.least, chord, offset)
+    return Limits(lower, safest, free, to_go.least, price, offset)
 
 
 @kernel
-def _chords(costs, low, gap):
-    """Find the slopes (sum,) and the constant of a plane below the failure cost of optimal paths.
+def _follow_tangents(graph, costs, edge_cost, least_cost, weights, sums, to_go, known):
+    """Try the cheapest paths for tangents to the concave sum_m weights_m (1 - exp(-r_m)).
 
-    An optimal path has sums of at least `low` and a failure cost of at most `gap`. The gap is the
-    cost of the best path found so far minus the least cost without failure.
+    The first tangent is the one at `sums`, the next one at the sums of the path found, and so on.
     """
-    failure = costs.failure
+    price = np.zeros(len(weights))
+    for _ in range(_N_TANGENTS):
+        before = price
+        price = weights * np.exp(-sums)
+        if np.abs(price - before).max() <= _PRICE_TOLERANCE * weights.max():
+            break
+        _fill_priced(graph, costs, least_cost, price, to_go)
+        _try_paths(graph, costs, edge_cost, to_go, known)
+        sums = known.sums
+
+
+@kernel
+def _highest(weights, low, most):
+    """Return the largest value (sum,) of each sum for which the failure is at most `most`.
+
+    Failure is sum_m weights_m (1 - exp(-r_m)); all sums are at least `low`.
+    """
+    high = np.full(len(low), np.inf)
+    at_low = _failing(weights, low)
+    for m in range(len(low)):
+        if weights[m] > 0.0:
+            # The other sums are at their lowest, so that this sum can be as large as possible.
+            share = (most - at_low) / weights[m] - math.expm1(-low[m])
+            if share < 1.0:
+                high[m] = -math.log1p(-max(share, 0.0))
+    return high
+
+
+@kernel
+def _chords(weights, low, high):
+    """Find the slopes (sum,) and the constant of a plane below sum_m weights_m (1 - exp(-r_m)).
+
+    The plane is below this concave function where all sums are between `low` and `high`.
+    """
     slopes = np.zeros(len(low))
     constant = 0.0
-    at_low = _failing(failure, low)
 
     for m in range(len(low)):
-        if failure[m] == 0.0:
+        if weights[m] == 0.0:
             continue
-
-        # If the other sums are at their lowest, this sum can rise to `high` before the gap is used.
-        here = -failure[m] * math.expm1(-low[m])
-        share = (gap - at_low + here) / failure[m]
-        high = -math.log1p(-max(share, 0.0)) if share < 1.0 else np.inf
-        if m == len(low) - 1:
-            high = min(high, costs.limit)
-
-        if low[m] < high < np.inf:
-            slopes[m] = (-failure[m] * math.expm1(-high) - here) / (high - low[m])
+        here = -weights[m] * math.expm1(-low[m])
+        if low[m] < high[m] < np.inf:
+            slopes[m] = (-weights[m] * math.expm1(-high[m]) - here) / (high[m] - low[m])
         constant += here - slopes[m] * low[m]
 
     return slopes, constant
 
 
-@kernel
-def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, known):
-    """Find the price of the limited sum that maximises the lower limit on the cost of all paths.
+class Relaxed(NamedTuple):
+    """Planes below the failure cost and below the failure probability.
 
-    The lower limit (the Lagrangian dual) is concave in the price. The slope is the limited sum of
-    the cheapest path minus the limit. The maximum is found by bisection (Handler and Zang 1980).
+    For sums r, the cost of failure is at least `offset` + `chord` . r, and the probability of
+    failure is at least `at_zero` + `slope` . r; `chord` and `slope` have shape (sum,).
     """
-    limit = costs.limit
-    price = chord.copy()
+
+    chord: np.ndarray
+    offset: float
+    slope: np.ndarray
+    at_zero: float
+
+
+@kernel
+def _price_of_limit(graph, costs, edge_cost, least_cost, relaxed, to_go, known):
+    """Find the price of the limit that maximises the lower limit on the cost of all paths.
+
+    The lower limit (the Lagrangian dual) is concave in the price. Its slope is the excess of the
+    cheapest path over the limit. The maximum is found by bisection (Handler and Zang 1980).
+    """
     lower = -np.inf
     chosen = 0.0
     extra = 0.0
@@ -347,19 +397,22 @@ def _price_of_limit(graph, costs, edge_cost, least_cost, chord, offset, to_go, k
     over = np.inf
 
     for _ in range(_N_PRICES):
-        price[-1] = chord[-1] + extra
+        price = relaxed.chord + extra * relaxed.slope
         _fill_priced(graph, costs, least_cost, price, to_go)
-        dual = offset + _try_paths(graph, costs, edge_cost, to_go, known)
+        dual = relaxed.offset + _try_paths(graph, costs, edge_cost, to_go, known)
         if extra > 0.0:  # otherwise, the limit may be inf, and 0 times inf is NaN
-            dual -= extra * limit
+            dual += extra * (relaxed.at_zero - costs.limit)
 
+        excess = relaxed.at_zero - costs.limit
+        for m in range(len(price)):
+            excess += relaxed.slope[m] * known.sums[m]
         if dual > lower:
             lower = dual
             chosen = extra
-        if lower >= known.cost[0] or (extra == 0.0 and known.sums[-1] <= limit):
+        if lower >= known.cost[0] or (extra == 0.0 and excess <= 0.0):
             break
 
-        if known.sums[-1] > limit:
+        if excess > 0.0:
             under = extra
         else:
             over = extra
@@ -481,7 +534,8 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
 @kernel
 def _is_hopeless(costs, limits, h, cost, sums, known):
     """Check whether no path that enters state h with this cost and these sums can be optimal."""
-    if sums[-1] + limits.safest[h, -1] > costs.limit:
+    smallest = sums + limits.safest[h]
+    if _is_beyond(costs, smallest):
         return True
 
     # A plane below the failure cost, with the limit relaxed.
@@ -492,7 +546,7 @@ def _is_hopeless(costs, limits, h, cost, sums, known):
         return True
 
     # The failure cost itself, at the smallest sums that can still be reached.
-    return cost + limits.free[h] + _failing(costs.failure, sums + limits.safest[h]) >= known
+    return cost + limits.free[h] + _failing(costs.failure, smallest) >= known
 
 
 @kernel

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn, cast
 
 import numpy as np
 import xarray as xr
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_positive
+from trustbo.hazard.components import Components
 from trustbo.hazard.risk import ROUNDING, Risk
 from trustbo.inference.learner import expected_and_drawn, params_of
 from trustbo.models.draws import Draws
@@ -119,7 +120,7 @@ class Problem:
         """Compute the expected cost of failure: `price` times the failure probability of a path."""
         if not self.risk or not self.price:
             return 0.0
-        return self.price * self.risk.priced(path)
+        return self.price * self.risk.failure(path)
 
     def costs_of_bounds(self, trust: np.ndarray, lost: np.ndarray) -> tuple[np.ndarray, float]:
         """Compute the costs of all bounds as if trust were not carried over; see `Planner.graph`.
@@ -157,7 +158,7 @@ class Problem:
         """Return whether a path respects `max_failure`."""
         if self.max_failure is None or self.risk is None:
             return True
-        return 1.0 - self.risk.survival(path) <= self.max_failure + ROUNDING
+        return self.risk.failure(path) <= self.max_failure + ROUNDING
 
     def recursion(
         self, params: Draws, x0: ArrayLike | None = None, *, by_robot: bool = False
@@ -195,19 +196,7 @@ class Problem:
         if self.risk is None or (self.max_failure is None and self.price == 0.0):
             return None
 
-        if self.risk.components is not None and self.price > 0.0:
-            p_fail, weights = self.risk.components
-        else:
-            p_fail = self.risk.p_fail[None]
-            weights = np.ones(1)
-
-        limit = np.inf
-        if self.max_failure is not None:
-            limit = -np.log1p(-self.max_failure) + ROUNDING
-            if len(weights) > 1:  # the last sum is for the mean of the components
-                p_fail = np.concatenate([p_fail, self.risk.p_fail[None]])
-                weights = np.append(weights, 0.0)
-
+        p_fail, weights = self._components
         missing = np.isnan(p_fail).any(0) & self.paths.bounds
         if missing.any():
             move, row, col = np.argwhere(missing)[0].tolist()
@@ -217,7 +206,14 @@ class Problem:
             )
 
         of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
-        return Risks(np.ascontiguousarray(of_bounds), self.price * weights, limit)
+        limit = np.inf if self.max_failure is None else self.max_failure + ROUNDING
+        return Risks(np.ascontiguousarray(of_bounds), self.price, weights, limit)
+
+    @property
+    def _components(self) -> Components:
+        """Components of the risk; without any, one that has the mean failure probabilities."""
+        risk = cast("Risk", self.risk)
+        return risk.components or Components(risk.p_fail[None], np.ones(1))
 
     def best(self, recursion: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the best admissible path for each draw of the recursion, or for a single draw.
@@ -252,7 +248,7 @@ class Problem:
             loss = LOSSES[self.likelihood.expected_rate]
             weights = Weights(0.0 * weights.per_bound, 0.0 * weights.constant, weights.scale)
 
-        risks = self.risks or Risks(np.zeros((len(bound_cost), 1)), np.zeros(1), np.inf)
+        risks = self.risks or Risks(np.zeros((len(bound_cost), 1)), 0.0, np.zeros(1), np.inf)
         costs = Costs(
             loss=loss,
             drift=drift,
@@ -263,13 +259,43 @@ class Problem:
             sd=np.maximum(recursion.noise_sd, TINY_SD),
             bound_cost=bound_cost,
             risk=risks.of_bounds,
-            failure=risks.failure,
+            failure=risks.price * risks.weights,
+            share=risks.weights,
             limit=risks.limit,
         )
         cost, lower, paths = best_labels(graph, costs, weights.scale)
-        if self.risk is not None and np.isinf(cost).any():
-            raise self._infeasible(self.risk)
+        if np.isinf(cost).any():
+            self._raise_infeasible()
         return -cost, -lower, paths
+
+    def safest(self) -> tuple[tuple[Cell, ...], float]:
+        """Find the admissible path with the smallest failure probability; it needs a risk.
+
+        Returns:
+            The path, and its failure probability, which accounts for the components of the risk.
+        """
+        graph = self.paths.graph
+        p_fail, weights = self._components
+        of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
+        n_bounds, n = len(of_bounds), graph.longest + 1
+
+        # No bound costs anything, and a failure costs 1.
+        costs = Costs(
+            loss=LOGISTIC,
+            drift=np.zeros((1, 1, n_bounds)),
+            weight=np.zeros((1, n, 1)),
+            start=np.zeros((1, n)),
+            transition=np.zeros((1, 0, 0)),
+            x0=np.zeros((1, 0)),
+            sd=np.ones(1),
+            bound_cost=np.zeros(n_bounds),
+            risk=np.ascontiguousarray(of_bounds),
+            failure=weights,
+            share=weights,
+            limit=np.inf,
+        )
+        p, _, paths = best_labels(graph, costs, np.ones(n))
+        return self.paths.cells(paths[0]), float(p[0])
 
     def _require_valid(self, recursion: Recursion, history: bool) -> None:
         """Raise TrustboError if the search is not exact for this recursion."""
@@ -284,18 +310,16 @@ class Problem:
                 f"{recursion.transition.min():g}; use 'terminal' or 'mean' instead."
             )
 
-    def _infeasible(self, risk: Risk) -> InfeasibleError:
-        """Return an error that says that no path respects `max_failure`, with the safest path."""
-        graph = self.paths.graph
-        n = graph.longest + 1
-        nothing = Weights(np.zeros((1, n, 1)), np.zeros((1, n)), np.ones(n))
-
-        # The safest path is the cheapest one if the cost of each bound is its risk -log(1 - p).
-        of_bounds = risk_of(risk.p_fail).ravel()
-        _, paths = best_sums(graph, np.zeros((1, 1, len(of_bounds))), nothing, of_bounds)
-        path = self.paths.cells(paths[0])
-        p_fail = 1.0 - risk.survival(path)
-        return InfeasibleError(
+    def _raise_infeasible(self) -> NoReturn:
+        """Raise an error that says that no path respects `max_failure`, with the safest path."""
+        path, p_fail = self.safest()
+        if p_fail <= cast("float", self.max_failure):
+            raise TrustboError(
+                f"the search stopped before it found a path with a failure probability of at most "
+                f"max_failure = {self.max_failure:g}; the safest path has {p_fail:.4g}. Increase "
+                "max_failure, or reduce max_bounds."
+            )
+        raise InfeasibleError(
             f"no admissible path from {path[0]} to {path[-1]} has a failure probability of at most "
             f"max_failure = {self.max_failure:g}. The smallest is {p_fail:.4g} on the path {path}. "
             "Increase max_failure or max_bounds, or use this path (attribute `path` of the error).",
@@ -307,14 +331,15 @@ class Problem:
 class Risks(NamedTuple):
     """Risks -log(1 - p_fail) of the bounds, which the search sums along a path.
 
-    `of_bounds` (bound, sum) has one column per component of the risk and, with several components
-    and a limit, one for their mean. A path whose risks add up to r_m in column m has the expected
-    failure cost sum_m F_m (1 - exp(-r_m)), where `failure` (sum,) contains the F_m. `limit` is the
-    largest value allowed for the sum of the last column.
+    `of_bounds` (bound, component) has one column per component of the risk. A path whose risks add
+    up to r_m in column m fails with the probability sum_m w_m (1 - exp(-r_m)), where `weights`
+    (component,) contains the w_m. This probability must not exceed `limit`, and a failure costs
+    `price`.
     """
 
     of_bounds: np.ndarray
-    failure: np.ndarray
+    price: float
+    weights: np.ndarray
     limit: float
 
 

@@ -24,7 +24,7 @@ from trustbo.planning.objectives import capped, has_history
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
-from trustbo.planning.problem import InfeasibleError, Problem, mean_and_draws_of, risk_of
+from trustbo.planning.problem import InfeasibleError, Problem, mean_and_draws_of
 from trustbo.planning.recursion import Recursion, states_along
 from trustbo.workspace.moves import MOVES
 
@@ -137,11 +137,8 @@ def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Cell]) -> f
 
 def _infeasible(problem: Problem, risk: Risk) -> InfeasibleError:
     """Return an error that says that no path respects `max_failure`, with the safest path."""
-    of_bounds = risk_of(risk.p_fail).ravel()
-    paths = cheapest_paths(problem.paths, of_bounds[problem.paths.graph.bound])
-
-    safest = max(paths, key=risk.survival)
-    p_fail = 1.0 - risk.survival(safest)
+    safest = min(every_path(problem.paths), key=risk.failure)
+    p_fail = risk.failure(safest)
     return InfeasibleError(
         f"no admissible path has a failure probability of at most max_failure = "
         f"{problem.max_failure:g}. The smallest is {p_fail:.4g}.",
