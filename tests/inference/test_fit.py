@@ -13,7 +13,7 @@ import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import add_latent, fit, importance, params_of, sample_prior
 from trustbo.inference.diagnostics import diagnostics
-from trustbo.inference.draws import prior_mean, read_posterior
+from trustbo.inference.draws import prior_mean, read_posterior, sample_prior_ahead
 from trustbo.inference.tree import parameters_alone
 from trustbo.inference.variables import to_variables
 from trustbo.models import (
@@ -161,6 +161,30 @@ def test_the_prior_mean_is_that_of_prior_draws():
     mean, drawn = prior_mean(model, 2), sample_prior(model, 2, 4000, 1)
     np.testing.assert_allclose(mean.beta[0], drawn.beta.mean(0), atol=0.02)
     np.testing.assert_allclose(mean.delta_w[0], 0.2 * np.sqrt(2.0 / np.pi), rtol=0.03)
+
+
+def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
+    """Their variances are those of half-normal standard deviations, E tau^2 = scale^2."""
+    effects = (PlaceEffect(0.2, 0.1), RobotEffect(0.3, 0.4))
+    z = np.random.default_rng(1).uniform(size=(3, 8, 4, 5, 2))
+    workspace = tb.Workspace.from_awareness(z, features=("traversability", "line_of_sight"))
+    draws = sample_prior_ahead(PooledTrust(effects=effects), workspace, 6000, 1)
+
+    assert draws.place.shape == (6000, 1, 4, 5)
+    assert draws.place_bound.shape == (6000, 1, 8, 4, 5)
+    assert draws.place.var(0).mean() == pytest.approx(0.2**2, rel=0.1)
+    assert draws.place_bound.var(0).mean() == pytest.approx(0.1**2, rel=0.1)
+    together = np.mean(draws.place[:, 0, 0, 0] * draws.place[:, 0, 0, 1])
+    assert 0.4 * 0.2**2 < together < 0.9 * 0.2**2
+
+    # The effect of a robot acts on stationary trust through the weight of line of sight.
+    stationary = draws.beta / (1.0 - draws.beta0[..., None])
+    own = stationary - stationary.mean(1, keepdims=True)
+    expected = (0.3**2 + 0.4**2) * 2.0 / 3.0  # around the mean of three robots
+    assert own[..., 1].var(0).mean() == pytest.approx(expected, rel=0.1)
+    np.testing.assert_allclose(own[..., 0], 0.0, atol=1e-12)
+    again = sample_prior_ahead(PooledTrust(effects=effects), workspace, 6000, 1)
+    np.testing.assert_array_equal(again.place, draws.place)
 
 
 def test_mistakes_are_refused_before_sampling(missions):

@@ -11,7 +11,7 @@ import xarray as xr
 from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError, require_count, require_kind, require_whole
 from trustbo.inference.density import Density, JointDraws
-from trustbo.inference.place_maps import place_maps_of
+from trustbo.inference.place_maps import place_group, place_maps_of
 from trustbo.inference.variables import draws_of, prior_parameters
 from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
@@ -19,6 +19,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
 from trustbo.models.params import Params, assemble_params
 from trustbo.models.record import effects_from_record, model_from_record, with_default_priors
+from trustbo.models.visited import visited
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
 
@@ -151,36 +152,51 @@ def _read_params(
 
     found = []
     for is_drawn in next_mission:
-        ahead = parameters | _robot_effects_ahead(posterior, model, parameters, is_drawn)
+        values = {effect: values_of(posterior, effect) for effect in _effects_of_robots(model)}
+        robots = _robot_effects_ahead(
+            values,
+            model.derived(parameters),
+            parameters,
+            features=names_in(posterior, "feature"),
+            n_robots=posterior.attrs["n_robots"],
+            n_missions=posterior.attrs["n_missions"],
+            is_drawn=is_drawn,
+        )
+        ahead = parameters | robots
         params = assemble_params(ahead, x0, memory)
         found.append(params._replace(**maps))  # pyright: ignore
     return found
 
 
+def _effects_of_robots(model: TrustModel) -> list[Effect]:
+    """Return the effects of a model that act on robots, not on places."""
+    return [effect for effect in model.effects if not isinstance(effect, PlaceEffect)]
+
+
 def _robot_effects_ahead(
-    posterior: xr.DataTree,
-    model: TrustModel,
+    values: Mapping[Effect, Mapping[str, np.ndarray]],
+    theta: Theta,
     parameters: Mapping[str, np.ndarray],
-    next_mission: bool,
+    *,
+    features: Sequence[str],
+    n_robots: int,
+    n_missions: int,
+    is_drawn: bool,
 ) -> dict[str, np.ndarray]:
-    """Return the parameters (draw, robot, ...) that robot effects change in the next mission."""
-    effects = [e for e in model.effects if not isinstance(e, PlaceEffect)]
-    if not effects:
+    """Return the parameters (draw, robot, ...) that robot effects change in the next mission.
+
+    `values` has the variables of each effect in the `n_missions` missions so far. The effects of
+    the next mission are drawn, or expected ones unless `is_drawn`.
+    """
+    if not values:
         return {}
 
-    theta = model.derived(parameters)
-    rng = np.random.default_rng(_NEXT_MISSION_SEED) if next_mission else None
+    rng = np.random.default_rng(_NEXT_MISSION_SEED) if is_drawn else None
     n_draws = len(theta["inverse_gain"])
-    n_robots = posterior.attrs["n_robots"]
-    n_missions = posterior.attrs["n_missions"]
-    slopes = [
-        effect.predict_next(values_of(posterior, effect), theta, n_missions, rng)
-        for effect in effects
-    ]
+    slopes = [effect.predict_next(v, theta, n_missions, rng) for effect, v in values.items()]
     slope = np.broadcast_to(sum(slopes), (n_draws, n_robots))
 
     # Robot effects act on line of sight, or on the intercept if it is not among the features.
-    features = posterior["posterior"].to_dataset()["feature"].values.tolist()
     sight = [m for m, name in enumerate(features) if is_line_of_sight(name)]
     weights = np.zeros((n_draws, n_robots, len(features)))
     if sight:
@@ -339,6 +355,46 @@ def sample_prior(
     prior = _prior(model, n_features, n_robots)
     rng = np.random.default_rng(seed)
     return assemble_params(prior_parameters(prior, n_draws, rng), model.x0, model.memory)
+
+
+def sample_prior_ahead(model: TrustModel, workspace: Workspace, n_draws: int, seed: int) -> Params:
+    """Draw parameters (draw, ...) from the prior, with the effects of places and of robots.
+
+    The effects of robots are those of the first mission.
+
+    Args:
+        model: Trust model.
+        workspace: Workspace, whose features, robots and cells are used.
+        n_draws: Number of draws.
+        seed: Random seed; the same seed gives the same draws.
+    """
+    features = workspace.features
+    n_robots = workspace.team.n_robots
+    rng = np.random.default_rng(seed)
+
+    prior = _prior(model, len(features), n_robots)
+    parameters = prior_parameters(prior, n_draws, rng)
+    drawn = model.scores(prior.observations).draw(n_draws, rng)
+    parameters |= {name: drawn[name] for effect in model.effects for name in effect.names}
+
+    maps = {}
+    if any(isinstance(effect, PlaceEffect) for effect in model.effects):
+        nowhere = {name: np.zeros((1, n_draws, 0)) for name in ("place", "place_bound")}
+        places = visited(np.full((1, 1, 3), -1), workspace.passable.shape)
+        maps = place_maps_of(place_group(nowhere, places, seed), parameters)
+
+    never = {"robot_effect": np.zeros((n_draws, 0, n_robots))}
+    robots = _robot_effects_ahead(
+        dict.fromkeys(_effects_of_robots(model), never),
+        model.derived(parameters),
+        parameters,
+        features=features,
+        n_robots=n_robots,
+        n_missions=0,
+        is_drawn=True,
+    )
+    params = assemble_params(parameters | robots, model.x0, model.memory)
+    return params._replace(**maps)  # pyright: ignore
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:

@@ -20,6 +20,7 @@ from trustbo.inference.draws import (
     read_posterior,
     require_posterior,
     sample_prior,
+    sample_prior_ahead,
 )
 from trustbo.inference.fit import SAMPLERS, fit, require_poolable_with_model
 from trustbo.inference.functions.draws import FunctionDraws
@@ -114,7 +115,11 @@ class Learner(Protocol):
         ...
 
     def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
-        """Draw parameters from the prior, with a leading axis (draw,)."""
+        """Draw parameters from the prior without effects, with a leading axis (draw,)."""
+        ...
+
+    def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
+        """Draw parameters from the prior with the effects of the first mission."""
         ...
 
     def prior_mean(self, workspace: Workspace) -> Draws:
@@ -208,6 +213,11 @@ class ClassLearner:
         n_robots = workspace.team.n_robots
         return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots).flat()
 
+    def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
+        """See `Learner.prior_draws_ahead`."""
+        model = self._known.for_features(workspace.features)
+        return sample_prior_ahead(model, workspace, n_draws, seed).flat()
+
     def prior_mean(self, workspace: Workspace) -> Draws:
         """See `Learner.prior_mean`."""
         features = workspace.features
@@ -286,6 +296,10 @@ class FunctionLearner:
     def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> FunctionDraws:
         """See `Learner.prior_draws`."""
         return prior_draws_of_function(self.model, n_draws, seed, workspace)
+
+    def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> FunctionDraws:
+        """See `Learner.prior_draws_ahead`; variables of one mission are always drawn."""
+        return self.prior_draws(n_draws, seed, workspace)
 
     def prior_mean(self, workspace: Workspace) -> Draws:
         """See `Learner.prior_mean`."""

@@ -89,7 +89,10 @@ class RobotEffect(Effect):
     def predict_next(
         self, values: Values, theta: Theta, n: int, rng: Generator | None
     ) -> np.ndarray:
-        """See `Effect.predict_next`; the next effect d is drawn given d in all n missions."""
+        """See `Effect.predict_next`; the next effect d is drawn given d in all n missions.
+
+        Without any mission, it is drawn from the prior.
+        """
         C = self._covariance(theta, n)
         slow = np.maximum(theta["tau_slow"], LEAST) ** 2
         k = slow[:, None] * self.rho ** np.arange(n, 0, -1)  # covariance of the next d with the n
@@ -97,7 +100,8 @@ class RobotEffect(Effect):
         gain = np.linalg.solve(C, k[..., None])[..., 0]
         d = np.einsum("nm,nmi->ni", gain, values["robot_effect"])
         if rng is not None:
-            variance = np.maximum(C[:, 0, 0] - (gain * k).sum(1), 0.0)  # rounding may make it < 0
+            unknown = sum(self._variances(theta))[:, 0]
+            variance = np.maximum(unknown - (gain * k).sum(1), 0.0)  # rounding may make it < 0
             d = d + np.sqrt(variance)[:, None] * rng.standard_normal(d.shape)
 
         return _inverse_gain(theta)[..., 0] * d
