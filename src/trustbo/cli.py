@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from trustbo.campaign.result import Result
     from trustbo.workspace import Workspace
 
-POLICIES = ("greedy", "optimistic", "thompson", "ucb", "random")
+POLICIES = ("explore", "greedy", "optimistic", "thompson", "ucb", "random")
 OBJECTIVES = ("lost_contact", "terminal", "mean")
 FORMATS = ("geotiff", "geojson", "csv", "nav2")
 BAD_INPUT = 2
@@ -91,7 +91,7 @@ def parser() -> argparse.ArgumentParser:
     add("--start", type=place, required=True, metavar="PLACE", help=PLACE)
     add("--goal", type=place, required=True, metavar="PLACE", help="in the same format as --start")
     _add_workspace(add)
-    add("--policy", choices=POLICIES, help="policy that chooses the paths (default greedy)")
+    add("--policy", choices=POLICIES, help="policy that chooses the paths (default explore)")
     add("--objective", choices=OBJECTIVES, help="objective of the paths (default lost_contact)")
     add("--paper", action="store_true", help="use the settings of the paper, with NUTS")
     _add_stop(add)
@@ -124,7 +124,13 @@ def _add_workspace(add: Any) -> None:
     add("--shape", type=shape, default=(10, 10), metavar="ROWS,COLS", help="cells (default 10,10)")
     add("--resolution", type=float, metavar="M", help="average the rasters to M-metre pixels")
     add("--robots", type=_count, default=3, metavar="N", help="overwatching robots (default 3)")
-    add("--max-slope", type=float, default=45.0, metavar="DEG", help="slope limit (default 45)")
+    add(
+        "--max-slope",
+        type=float,
+        default=45.0,
+        metavar="DEG",
+        help="slope limit (default 45); if in doubt, 2 to 3 degrees less than the robots withstand",
+    )
 
 
 def _add_stop(add: Any) -> None:

@@ -29,7 +29,9 @@ class Robot:
         sensor_height: Height of the lidar above ground, m.
         target_height: Height above ground of the point on this robot that the lidars of other
             robots aim at, m.
-        max_slope: Steepest pitch or roll that the robot withstands, rad.
+        max_slope: Steepest pitch or roll that the robot withstands, rad. If you are not sure, enter
+            a limit that is 2 to 3 degrees lower: too low a limit makes paths a little longer, and
+            too high a limit makes missions fail.
         detection: Quality of the lidar: fraction of unobstructed scans that detect their target, in
             (0, 1].
         acquire: Number of successive scans that must detect a target before contact begins.
