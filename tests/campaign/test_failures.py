@@ -7,12 +7,12 @@ import pytest
 from worlds import ModelSimulator, random_cells
 
 import trustbo as tb
-from trustbo.campaign.learning import informed_planner
+from trustbo.campaign.learning import informed_planner, instead_of_failure
 from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import LostMission
-from trustbo.workspace.moves import moves_along
+from trustbo.workspace.moves import bounds_along, moves_along
 
 ENDS = ((3, 0), (0, 3))
 
@@ -194,7 +194,7 @@ def test_price_after_a_failure_is_joint_over_strata(steep):
     rows, cols = np.array(path[1:]).T
     joint = 8.0 * weights @ (1.0 - np.prod(1.0 - p[:, moves_along(path), rows, cols], axis=1))
     assert problem.failure_along(path) == pytest.approx(joint, rel=1e-12)
-    assert joint < 8.0 * (1.0 - problem.risk.survival(path)) - 1e-3
+    assert joint < 8.0 * (1.0 - np.prod(1.0 - problem.risk.along(path).p_fail)) - 1e-3
 
 
 def test_limit_holds_without_a_price_and_warns_if_no_path_keeps_it(workspace, hills):
@@ -209,6 +209,36 @@ def test_limit_holds_without_a_price_and_warns_if_no_path_keeps_it(workspace, hi
 
 
 # --- what is given up ---
+
+
+def test_the_safest_path_is_planned_if_all_are_likely_to_fail(workspace):
+    """Above 90 %, a failure costs the same on every path, so contact would decide."""
+    planner = begin(workspace).planner
+    mean = begin(workspace).belief.mean()
+    around = ((3, 0), (3, 1), (3, 2), (2, 3), (1, 3), (0, 3))
+    p_fail = np.full((8, 4, 4), 0.95)
+    p_fail[*bounds_along(around).T] = 0.6
+    many = planner.with_failure_cost(8.0).with_risk(p_fail)
+    few = planner.with_failure_cost(8.0).with_risk(0.1 * p_fail)
+    free = many.with_failure_cost(0.0)
+
+    assert many.plan(mean).path != around
+    assert many.problem.safest() == (around, pytest.approx(1.0 - 0.4**5))
+    assert instead_of_failure(many, many.plan(mean), mean).path == around
+    for other in (few, free):
+        plan = other.plan(mean)
+        assert instead_of_failure(other, plan, mean) is plan
+
+
+def test_a_plan_that_almost_certainly_fails_is_replaced_with_a_warning(steep):
+    hazard = Hazard(margin=(9.0, 0.5), doubt=(0.0, 1.0))
+    campaign = begin(steep, planner={"failure_cost": 0.1}, hazard=hazard)
+    safest, p_fail = campaign.planner.problem.safest()
+    assert p_fail > 0.9
+    assert campaign.planner.plan(campaign.belief.mean()).path != safest
+    with pytest.warns(UserWarning, match="almost certainly fails"):
+        plan = campaign.ask()
+    assert plan.path == safest == tuple(campaign.path)
 
 
 def test_next_try_may_take_another_path(workspace):

@@ -12,7 +12,8 @@ from worlds import random_cells
 
 import trustbo as tb
 from trustbo.campaign.learning import as_learned
-from trustbo.inference import TrustFilter, sample_prior
+from trustbo.inference import TrustFilter
+from trustbo.inference.draws import sample_prior_ahead
 from trustbo.models import PooledTrust
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,9 +62,9 @@ def filter_of(campaign):
     """Filter of the campaign's posterior, or of its prior."""
     if campaign.state.last is not None:
         return TrustFilter(campaign.posterior)
-    model = campaign.model.for_features(campaign.workspace.features)
-    draws = sample_prior(model, 2, 1000, campaign.state.seed_of("prior"), n_robots=3)
-    return TrustFilter(draws, 3, family=model.family)
+    model = campaign.model
+    draws = sample_prior_ahead(model, campaign.workspace, 250, campaign.state.seed_of("prior"))
+    return TrustFilter(draws, 3, family=model.family, workspace=campaign.workspace)
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,24 @@ def test_optimistic_is_drawn_to_cells_it_knows_nothing_of():
     assert median.path == planner.plan(draws.draw(0)).path
 
 
+def test_explore_leaves_a_path_that_repeats_only_in_doubt(workspace):
+    planner = Planner(workspace, *ENDS, "mean", max_bounds="shortest+2")
+    draws = prior_draws(HierarchicalTrust())
+    best = policies.greedy(rng(), draws, planner).path
+    other = policies.ucb(rng(), draws, planner).path
+    doubt = np.mean(planner.plan_draws(draws).relative_regret(best) > 0.02)
+    assert best != other
+    assert 0.1 < doubt < 0.999
+
+    def explored(driven, **options):
+        return policies.explore(rng(), draws, planner, driven=driven, **options).path
+
+    assert explored([other, best, best]) == other
+    assert explored([best, best], doubt=0.999) == best
+    for driven in ([], [best], [best, other], [best, other, best]):
+        assert explored(driven) == best
+
+
 def test_random_paths_ignore_what_was_learned_and_keep_the_limit(workspace):
     planner = Planner(workspace, *ENDS)
     paths = [
@@ -102,7 +120,7 @@ def test_random_paths_ignore_what_was_learned_and_keep_the_limit(workspace):
 
 def test_policies_have_names_and_can_be_one_s_own():
     own = lambda rng, params, planner: planner.plan(params.mean())  # noqa: E731
-    assert next(iter(POLICIES)) == "greedy"
+    assert next(iter(POLICIES)) == "explore"
     assert resolve_policy(own) is own
     for wrong in ("bold", None):
         with pytest.raises(TrustboError, match="policy"):

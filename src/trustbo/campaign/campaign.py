@@ -14,6 +14,7 @@ from trustbo.campaign.learning import (
     AWARENESS,
     as_learned,
     informed_planner,
+    instead_of_failure,
     is_excluded_by_user,
     learn,
     learn_hazard,
@@ -33,7 +34,7 @@ from trustbo.campaign.settings import (
 from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Posterior, State
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import MemoryStorage, Storage
-from trustbo.data import Cell, Mission
+from trustbo.data import Cell, Mission, path_text
 from trustbo.display import compiling, tqdm
 from trustbo.errors import (
     TrustboError,
@@ -52,7 +53,7 @@ from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.learner import Model, learner_from_record, learner_of
 from trustbo.models.draws import Draws
 from trustbo.planning import InfeasibleError, Plan, Planner
-from trustbo.planning.policies import POLICIES, Policy, resolve_policy
+from trustbo.planning.policies import POLICIES, Policy, choose_plan, resolve_policy
 from trustbo.simulation import KinematicSimulator, RealtimeAwareness
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
@@ -89,7 +90,7 @@ class Campaign(Result):
         goal: Location,
         *,
         model: Model | None = None,
-        policy: str | Policy = "greedy",
+        policy: str | Policy = "explore",
         objective: str = "lost_contact",
         sampler: str | None = None,
         seed: int = 0,
@@ -114,7 +115,8 @@ class Campaign(Result):
             model: Trust model, or a NumPyro function `model(awareness, contact_rate=None)`; by
                 default `models.default_model()`, with place and robot effects.
             policy: Name in `planning.POLICIES`, or a callable `policy(rng, draws, planner)` that
-                returns a Plan.
+                returns a Plan; see `planning.policies`. The default is the best path under the
+                posterior mean, until it repeats itself although it may not be the best.
             objective: Objective of the paths; see `planning.Planner`.
             sampler: Sampler of the posterior; by default as in `trustbo.fit`.
             seed: Seed of all random numbers.
@@ -321,22 +323,37 @@ class Campaign(Result):
         self.storage.require_open()
         self._catch_up()
         rng = np.random.default_rng(self.state.seed_of("policy"))
-        return self._choose(rng, self.belief, self.planner)
+        driven = [entry.mission.path for entry in self.state.entries]
+        return self._choose(rng, self.belief, self.planner, driven)
 
-    def _choose(self, rng: np.random.Generator, draws: Draws, planner: Planner) -> Plan:
+    def _choose(
+        self,
+        rng: np.random.Generator,
+        draws: Draws,
+        planner: Planner,
+        driven: Sequence[Sequence[Cell]] = (),
+    ) -> Plan:
         """Plan a path with the policy, and check what it returned."""
         name = f"policy {self.state.settings['policy']!r}"
+        mean = draws.mean()
         try:
-            plan = self.policy(rng, draws, planner)
+            plan = choose_plan(self.policy, rng, draws, planner, driven)
         except InfeasibleError as error:  # `_record` issues the warning
-            plan = planner.evaluate(error.path, draws.mean())
+            return planner.evaluate(error.path, mean)
 
         require_kind(name, plan, Plan, "a policy must return a trustbo.planning.Plan")
         try:
             planner.require_path(plan.path)
         except TrustboError as error:
             raise TrustboError(f"{name}: {error}") from None
-        return plan
+
+        safest = instead_of_failure(planner, plan, mean)
+        if safest.path != plan.path:
+            warn(
+                f"the path {path_text(plan.path)} almost certainly fails; the safest path is "
+                f"planned instead, which arrives with probability {safest.p_arrive:.2g}."
+            )
+        return safest
 
     def suggest(self, path: Sequence[Cell]) -> Plan:
         """Set the next path manually; `ask` then returns it.
@@ -416,7 +433,7 @@ class Campaign(Result):
 
     def _with_bands(self, plan: Plan) -> Plan:
         """Add the posterior bands to a plan."""
-        return plan.with_draws(self.planner.evaluate(plan.path, self.belief))
+        return plan.with_draws(self.planner.evaluate(plan.path, self.forecast))
 
     def _accept(self, plan: Plan) -> Plan:
         """Record a plan, with posterior bands, as the next one to run."""

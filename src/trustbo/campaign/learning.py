@@ -13,7 +13,8 @@ from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import LostMission
 from trustbo.inference.learner import Learner
-from trustbo.planning import Planner
+from trustbo.models.draws import Draws
+from trustbo.planning import Plan, Planner
 from trustbo.stacking import pooled
 from trustbo.workspace import Workspace
 
@@ -23,6 +24,8 @@ _STOPPED = 2
 """Failures after which a bound is avoided."""
 _RECOVERED = 0.2
 """Failure probability below which such a bound is allowed again."""
+_HOPELESS = 0.9
+"""Failure probability of the best path above which the safest path is planned instead."""
 
 
 AWARENESS = ("map", "measured")
@@ -176,6 +179,28 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     if planner.problem.failure_cost is None and not risk.has_failures:
         planner = planner.with_failure_cost(0.0)
 
-    priced = planner.problem.objective.of_contact and planner.problem.failure_cost != 0.0
-    components = risk.components() if priced else None
+    problem = planner.problem
+    priced = problem.objective.of_contact and problem.failure_cost != 0.0
+    components = risk.components() if priced or problem.max_failure is not None else None
     return planner.with_risk(risk.mean, risk.draw(_N_RISKS), components)
+
+
+def instead_of_failure(planner: Planner, plan: Plan, mean: Draws) -> Plan:
+    """Return the plan, or the safest one if the plan almost certainly fails.
+
+    If all paths are likely to fail, their costs of failure are nearly equal, so that the plan would
+    minimise lost contact again. Applies only if failures have a cost.
+
+    Args:
+        planner: Planner of `informed_planner`.
+        plan: Plan of a policy.
+        mean: Parameters for which the safest path is evaluated.
+    """
+    problem = planner.problem
+    if problem.risk is None or not problem.price:
+        return plan
+    if problem.risk.failure(plan.path) <= _HOPELESS:
+        return plan
+
+    path, _ = problem.safest()
+    return planner.evaluate(path, mean)

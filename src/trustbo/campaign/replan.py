@@ -21,8 +21,6 @@ from trustbo.planning.problem import Problem
 
 Pair = tuple[Cell, ...]
 """Cell left and cell entered."""
-_N_DRAWS = 1000
-"""Draws of the prior, from which trust is estimated before the first posterior."""
 
 
 class Driven(NamedTuple):
@@ -47,12 +45,8 @@ class Driven(NamedTuple):
 
 def trust_filter(result: Result) -> TrustFilter:
     """Make the filter of a campaign's next mission, from its last posterior or from its prior."""
-    if result.state.posterior is None:
-        draws = result.draw_prior(_N_DRAWS)
-    else:
-        draws = result.forecast
     return TrustFilter(
-        draws,
+        result.forecast,
         result.workspace.team.n_robots,
         family=result.learner.family,
         workspace=result.workspace,

@@ -11,7 +11,12 @@ import xarray as xr
 
 from trustbo.campaign.cache import computed
 from trustbo.campaign.folder import FolderStorage, without_lost_posteriors
-from trustbo.campaign.learning import fitted_missions, informed_planner, learn_hazard
+from trustbo.campaign.learning import (
+    fitted_missions,
+    informed_planner,
+    instead_of_failure,
+    learn_hazard,
+)
 from trustbo.campaign.read import read_campaign
 from trustbo.campaign.record import RECORD
 from trustbo.campaign.settings import to_planner
@@ -35,6 +40,8 @@ if TYPE_CHECKING:
 
 _N_PRIOR_DRAWS = 1000
 """Draws from the prior for `Result.trust` before anything was learned."""
+_N_PRIOR_AHEAD = 250
+"""The same for bands, with place effects of all cells, which are large."""
 _FIRST_COLUMNS = (
     "mission",
     "status",
@@ -169,8 +176,14 @@ class Result(Summary):
 
     @computed
     def forecast(self) -> Draws:
-        """Draws like `belief`, with effects drawn for the next mission, for bands."""
-        return self.belief if self._drawn is None else self._drawn[1]
+        """Draws like `belief`, with effects drawn for the next mission, for bands.
+
+        Before anything was learned, they are draws of the prior.
+        """
+        if self._drawn is not None:
+            return self._drawn[1]
+        seed = State(self.state.settings).seed_of("prior")
+        return self.learner.prior_draws_ahead(_N_PRIOR_AHEAD, seed, self.workspace)
 
     @computed
     def _drawn(self) -> tuple[Draws, Draws] | None:
@@ -203,13 +216,15 @@ class Result(Summary):
     def recommend(self) -> Plan:
         """Plan the best path under the mean of `belief`, regardless of the policy.
 
-        If no path satisfies `max_failure`, the safest path is returned.
+        If no path satisfies `max_failure`, or the best one almost certainly fails, the safest path
+        is returned.
         """
         mean = self.belief.mean()
         try:
-            return self.planner.plan(mean)
+            plan = self.planner.plan(mean)
         except InfeasibleError as error:
             return self.planner.evaluate(error.path, mean)
+        return instead_of_failure(self.planner, plan, mean)
 
     @computed
     def plan(self) -> Plan:

@@ -1,26 +1,31 @@
 """Policies, which choose the next plan based on posterior draws.
 
 A policy is any callable `policy(rng, params, planner) -> Plan`. A callable can be passed wherever
-the name of a policy is accepted. The policies below report the trust and value of their plan for
-the posterior mean of the parameters.
+the name of a policy is accepted. A policy with a parameter `driven` also gets the paths of all
+missions, in order. The policies below report the trust and value of their plan for the posterior
+mean of the parameters.
 """
 
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from trustbo.data import Cell
 from trustbo.errors import require_choice, require_finite, require_kind, require_share
 from trustbo.models.draws import Draws
-from trustbo.planning.draws import choose_draws
+from trustbo.planning.draws import DrawnPaths, choose_draws
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.recursion import Recursion
 
-Policy = Callable[[np.random.Generator, Draws, Planner], Plan]
+Policy = Callable[..., Plan]
 """Function of a random generator, draws with leading axis (draw,) and a planner; returns a plan."""
 
 N_DRAWS = 200
-"""Number of draws for which `ucb` finds the best path."""
+"""Number of draws for which `ucb` and `explore` find the best path."""
+_N_REPEATED = 2
+"""Missions on the same path after which `explore` may leave it."""
 _N_DRIFTS = 1000  # number of draws whose quantiles `optimistic` computes
 
 
@@ -64,9 +69,44 @@ def ucb(rng: np.random.Generator, params: Draws, planner: Planner, *, kappa: flo
     require_finite("kappa", kappa)
 
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
-    values = drawn.values_of(drawn.candidates)
-    chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
-    return planner.evaluate(drawn.candidates[chosen], params.mean())
+    return planner.evaluate(_most_promising(drawn, kappa), params.mean())
+
+
+def explore(
+    rng: np.random.Generator,
+    params: Draws,
+    planner: Planner,
+    *,
+    driven: Sequence[Sequence[Cell]] = (),
+    regret: float = 0.02,
+    doubt: float = 0.1,
+) -> Plan:
+    """Plan as `greedy`, but as `ucb` if the plan repeats itself although it may not be the best.
+
+    A greedy campaign may repeat a path for ever and never learn that another one is better. If the
+    best path under the posterior mean was driven in both of the last two missions, and its relative
+    regret exceeds `regret` with a probability above `doubt`, the path is chosen as in `ucb`.
+
+    Args:
+        rng: Random generator.
+        params: Posterior draws, with leading axis (draw,).
+        planner: Planner of the paths.
+        driven: Paths of all missions, in order.
+        regret: Acceptable regret of the plan, as a fraction; see `DrawnPaths.relative_regret`.
+        doubt: Acceptable probability of a larger regret.
+    """
+    plan = greedy(rng, params, planner)
+    require_share("regret", regret)
+    require_share("doubt", doubt)
+
+    last = [tuple(path) for path in driven[-_N_REPEATED:]]
+    if last != [plan.path] * _N_REPEATED:
+        return plan
+
+    drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
+    if np.mean(drawn.relative_regret(plan.path) > regret) <= doubt:
+        return plan
+    return planner.evaluate(_most_promising(drawn, kappa=1.0), params.mean())
 
 
 def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
@@ -83,6 +123,7 @@ def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
 
 
 POLICIES: dict[str, Policy] = {
+    "explore": explore,
     "greedy": greedy,
     "optimistic": optimistic,
     "thompson": thompson,
@@ -99,6 +140,26 @@ def resolve_policy(policy: str | Policy) -> Policy:
         TrustboError: If `policy` is neither a known name nor a callable.
     """
     return policy if callable(policy) else POLICIES[require_choice("policy", policy, POLICIES)]
+
+
+def choose_plan(
+    policy: Policy,
+    rng: np.random.Generator,
+    params: Draws,
+    planner: Planner,
+    driven: Sequence[Sequence[Cell]],
+) -> Plan:
+    """Call a policy, with the paths of all missions if it has a parameter `driven`."""
+    if "driven" in inspect.signature(policy).parameters:
+        return policy(rng, params, planner, driven=driven)
+    return policy(rng, params, planner)
+
+
+def _most_promising(drawn: DrawnPaths, kappa: float) -> tuple[Cell, ...]:
+    """Return the candidate with the largest mean + `kappa` sd of its value over the draws."""
+    values = drawn.values_of(drawn.candidates)
+    chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))
+    return drawn.candidates[chosen]
 
 
 def _require(rng: object, params: object, planner: object) -> None:
