@@ -100,8 +100,8 @@ class RobotEffect(Effect):
         gain = np.linalg.solve(C, k[..., None])[..., 0]
         d = np.einsum("nm,nmi->ni", gain, values["robot_effect"])
         if rng is not None:
-            unknown = sum(self._variances(theta))[:, 0]
-            variance = np.maximum(unknown - (gain * k).sum(1), 0.0)  # rounding may make it < 0
+            of_one = slow + np.maximum(theta["tau_mission"], LEAST) ** 2
+            variance = np.maximum(of_one - (gain * k).sum(1), 0.0)  # rounding may make it < 0
             d = d + np.sqrt(variance)[:, None] * rng.standard_normal(d.shape)
 
         return _inverse_gain(theta)[..., 0] * d
