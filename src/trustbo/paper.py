@@ -16,13 +16,17 @@ Model:
 
 Data:
 
-- Learning uses the awareness of the map. In the paper, robots measure awareness in every bound.
+- Learning uses the awareness that a mission contains. The default simulator writes that of the map.
+  In the paper, robots measure awareness in every bound: run missions with
+  `simulator=simulation.RealtimeAwareness(...)`, or tell missions with measured awareness. Plans
+  always use the map.
 - Each feature is a principal component as in the paper, but of clipped pixel features, and its sign
   is declared instead of left to the solver.
 - While T2 closes up, contact is that of the lead's lidar, and counts in the rates of the robots.
 - The lead stops near the centre of the next cell, where the routes around are seen best.
-- Campaigns start from the prior and learn from all of their missions at once. In the paper, the
-  posterior of a given terrain is the prior on the mission terrain.
+- Campaigns learn from all missions at once. In the paper, the posterior is the prior of the next
+  iteration, and that of a given terrain is the prior on the mission terrain: pass the result on the
+  given terrain as `earlier=`.
 
 Planning:
 
@@ -53,11 +57,12 @@ CAMPAIGN: Mapping[str, Any] = {
     "objective": "terminal",
     "initial": "prior_draw",
     "sampler": "nuts",
+    "awareness": "measured",
 }
 """Keywords of `iterate` and `Campaign`. The model consists of equations (3) and (4), with one set
 of parameters for all robots and no effects; NUTS samples its posterior (5). Each path minimises the
 cost (6), 1 - sigma(trust at the goal), under the posterior mean. The first path minimises the cost
-under one draw of the prior."""
+under one draw of the prior. Learning uses measured awareness where there is any."""
 
 MEAN_TRUST: Mapping[str, Any] = {**CAMPAIGN, "objective": "mean"}
 """Keywords like `CAMPAIGN`, but each path maximises the mean trust over its bounds. The paper also
