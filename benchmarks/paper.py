@@ -128,6 +128,7 @@ def run_campaign(world: World, course: str, driver: str, given: Any) -> list[dic
         **tb.paper.CAMPAIGN,
         "model": MODELS[given.model],
         "sampler": "importance",
+        "awareness": "map",  # the simulators of the worlds measure no awareness
         "policy": policy,
         "objective": OBJECTIVES[judged[0]],
         "seed": seed,

@@ -16,10 +16,8 @@ Model:
 
 Data:
 
-- Learning uses the awareness that a mission contains. The default simulator writes that of the map.
-  In the paper, robots measure awareness in every bound: run missions with
-  `simulator=simulation.RealtimeAwareness(...)`, or tell missions with measured awareness. Plans
-  always use the map.
+- Measured awareness, simulated by `simulation.RealtimeAwareness`, is used for learning, and the
+  awareness of the map for planning and where nothing was measured.
 - Each feature is a principal component as in the paper, but of clipped pixel features, and its sign
   is declared instead of left to the solver.
 - While T2 closes up, contact is that of the lead's lidar, and counts in the rates of the robots.
