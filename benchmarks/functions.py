@@ -178,7 +178,8 @@ def of_likelihoods(function, values, model, tree, missions):
     wanted = whole["log_likelihood"]["contact_rate"].values.reshape(-1, len(missions))
     data = {"observations": model.observations(missions)}
     data |= {"awareness": data["observations"].awareness,
-             "contact_rate": data["observations"].contact_rate}  # fmt: skip
+             "contact_rate": data["observations"].contact_rate,
+             "features": missions[0].features}  # fmt: skip
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(0), len(wanted))
     found = function.over_draws("evaluate", 2, data)(values, keys).log_likelihood

@@ -1,9 +1,12 @@
 """What a terminal and a notebook show of an object."""
 
+import io
+import sys
 from functools import cache
 from xml.etree import ElementTree
 
 import numpy as np
+import pytest
 from numba import njit
 
 import trustbo as tb
@@ -57,3 +60,15 @@ def test_compiling_is_announced_once(capsys, monkeypatch):
         with compiling():
             njit(lambda x, more=more: x + more)(1)
     assert capsys.readouterr().err.count("compiling") == 1
+
+
+@pytest.mark.parametrize("is_terminal", [True, False])
+def test_a_bar_is_shown_in_a_terminal_but_not_in_a_log(monkeypatch, is_terminal):
+    stream = io.StringIO()
+    monkeypatch.setattr(stream, "isatty", lambda: is_terminal, raising=False)
+    monkeypatch.setattr(sys, "stderr", stream)
+    with display.bar(True, desc="missions", total=2) as shown, display.bar(False) as hidden:
+        shown.update()
+    assert shown.disable is not is_terminal
+    assert hidden.disable
+    assert ("missions" in stream.getvalue()) == is_terminal

@@ -60,7 +60,20 @@ def joined(names: Sequence[str]) -> str:
 
 def slow_bar(name: str, unit: str, shown: bool, *, total: int | None = None) -> tqdm:
     """Make a progress bar that appears only if the work takes longer than 5 seconds."""
-    return tqdm(desc=name, unit=unit, total=total, delay=_PATIENCE, disable=not shown, leave=False)
+    return bar(shown, desc=name, unit=unit, total=total, delay=_PATIENCE, leave=False)
+
+
+def bar(shown: bool, **options: Any) -> tqdm:
+    """Make a progress bar, unless nobody sees it; see `shows_bars`."""
+    return tqdm(disable=not (shown and shows_bars()), **options)
+
+
+def shows_bars() -> bool:
+    """Return whether this is a terminal or a notebook; a log file would get all states of a bar."""
+    ipython = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython else None
+    is_notebook = type(shell).__name__ == "ZMQInteractiveShell"
+    return is_notebook or sys.stderr.isatty()
 
 
 def compiling() -> AbstractContextManager[Any]:

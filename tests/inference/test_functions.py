@@ -12,6 +12,7 @@ import numpyro.distributions as dist
 import pytest
 import xarray as xr
 from numpyro.handlers import reparam
+from numpyro.infer.reparam import LocScaleReparam
 from numpyro.infer.util import log_density
 from scipy import stats
 
@@ -222,6 +223,64 @@ def test_variables_of_one_mission_are_drawn_for_the_next(missions, workspace):
     np.testing.assert_allclose(off.std(), 0.05, rtol=0.1)
 
 
+def recorded(awareness, features, contact_rate=None):
+    """A function that records what it computes."""
+    with numpyro.plate("robot", awareness.shape[2]):
+        weight = numpyro.sample("weight", dist.Normal(0.3, 0.1))
+        numpyro.deterministic("double", 2.0 * weight)
+    with numpyro.plate("feature", 5):
+        lam = numpyro.sample("lam", dist.Normal(0.0, 0.1))
+        numpyro.deterministic("cube", lam**3)
+    plate = numpyro.plate("mission", len(awareness))
+    with plate:
+        z = numpyro.sample("z", dist.Normal())
+    day = numpyro.deterministic("day", 0.05 * z)
+    drift = weight * awareness[..., features.index("line_of_sight")] + day[:, None, None]
+    numpyro.deterministic("drift", drift)
+    with plate:
+        rates = ContactRate(drift, 0.4, 0.05, 0.05)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+def test_deterministic_sites_are_stored_with_the_axes_of_their_plates(missions, workspace):
+    model = reparam(recorded, config={"weight": LocScaleReparam(0.0)})
+    fitted = tb.fit(
+        missions, model, workspace=workspace, draws=100, check=False, latent=False, progress=False
+    )
+    for group, sizes in (("posterior", (4, 100)), ("prior", (1, 500))):
+        found = fitted[group].to_dataset()
+        assert {n: found[n].dims[2:] for n in ("weight", "double", "cube", "lam", "day")} == {
+            "weight": ("robot",),  # moved there by the reparametrisation
+            "double": ("robot",),
+            "cube": ("feature_plate",),  # there are two features
+            "lam": ("feature_plate",),
+            "day": ("mission",),
+        }
+        assert "drift" not in found  # has the axis of bounds
+        assert found["day"].shape == (*sizes, 3)  # without padding
+        np.testing.assert_allclose(found["double"], 2.0 * found["weight"], rtol=1e-12)
+        np.testing.assert_allclose(found["cube"], found["lam"] ** 3, rtol=1e-12)
+        np.testing.assert_allclose(found["day"], 0.05 * found["z"], rtol=1e-12)
+    assert list(fitted["posterior"]["double"]["robot"].values) == ["r1", "r2", "r3"]
+
+
+def test_features_are_found_by_their_names(workspace):
+    """Without a mission, the drift is that of the feature in any order."""
+    awareness = np.random.default_rng(0).uniform(size=(3, 5, 5, 2))  # that of `workspace`
+    other = tb.Workspace.from_awareness(awareness[..., ::-1], features=FEATURES[::-1])
+    drifts = []
+    for one in (workspace, other):
+        campaign = tb.Campaign(one, (4, 0), (0, 4), model=by_name)
+        drifts.append(campaign.draw_prior(3).inputs(one.awareness.values))
+    np.testing.assert_allclose(*drifts, rtol=1e-12)
+
+
+def by_name(awareness, features, contact_rate=None):
+    weight = numpyro.sample("weight", dist.Normal(0.3, 0.1))
+    drift = weight * awareness[..., features.index("line_of_sight")]
+    numpyro.sample("contact_rate", ContactRate(drift, 0.4, 0.05, 0.05), obs=contact_rate)
+
+
 def refused(inner):
     def model(awareness, contact_rate=None):
         inner(awareness, contact_rate)
@@ -236,6 +295,32 @@ def without_site(awareness, rates):
 def normal(awareness, rates):
     a = numpyro.sample("a", dist.Normal())
     numpyro.sample("contact_rate", dist.Normal(a + awareness[..., 0], 0.1), obs=rates)
+
+
+def independent(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    normal = dist.Normal(a + awareness[..., 0], 0.1).to_event(2)
+    numpyro.sample("contact_rate", normal, obs=rates)
+
+
+def out_of_range(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    drift = a * awareness[..., 2]  # JAX would take the last of two features
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
+
+
+def without_axes(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    with numpyro.plate("mission", len(awareness)):
+        off = numpyro.sample("off", dist.Normal())
+    drift = a + off + awareness[..., 0]
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
+
+
+def without_robots(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    drift = a + awareness[..., 0].mean(-1)
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
 
 
 def unobserved(awareness, rates):
@@ -266,11 +351,18 @@ def broken(awareness, rates):
     [
         (refused(without_site), "has no site 'contact_rate', only 'a'"),
         (refused(normal), "has the distribution Normal; it must be tb.models.ContactRate"),
+        (refused(independent), "has the distribution Normal"),
         (refused(unobserved), "is not observed; pass obs=contact_rate"),
         (refused(named_draw), "has the name of an axis"),
         (refused(discrete), "the site 'a' .* is discrete"),
         (refused(without_variables), "has no latent variable"),
         (refused(broken), "failed with RuntimeError: no such luck"),
+        (
+            refused(out_of_range),
+            r"index 2 is out of bounds.*line_of_sight \(1\)",
+        ),
+        (refused(without_axes), r"TypeError.*the drift must be \(mission, bound, robot\)"),
+        (refused(without_robots), r"the function model: drift must .*the axis of the robots"),
         (shaped, r"must have the shape .* = \(4, 8, 3\).*got \(4, 8, 2\)"),
         (lambda z, rates=None: None, "must have the parameters awareness and contact_rate"),
         (lambda awareness, contact_rate, colour: None, "the parameter 'colour'"),

@@ -35,7 +35,8 @@ from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, Failure, Post
 from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import MemoryStorage, Storage
 from trustbo.data import Cell, Mission, path_text
-from trustbo.display import compiling, tqdm
+from trustbo.display import bar as progress_bar
+from trustbo.display import compiling
 from trustbo.errors import (
     TrustboError,
     require_bounds,
@@ -684,7 +685,7 @@ class Campaign(Result):
         state = self.state
         state.stop_reason = "interrupted"
         options = {"total": n_iterations, "initial": len(state.entries), "desc": "missions"}
-        with tqdm(disable=not self._progress, **options) as bar, compiling():
+        with progress_bar(self._progress, **options) as bar, compiling():
             # Check the rule before each mission: it may already apply when a campaign is resumed.
             while not (reason := self._reason_to_end(n_iterations, stop)):
                 plan = self.ask()

@@ -22,6 +22,7 @@ from numpyro.infer import MCMC, NUTS, init_to_value
 from numpyro.infer.util import ParamInfo
 from scipy import optimize
 
+from trustbo.display import shows_bars
 from trustbo.inference import importance
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.diagnostics import complaints_of
@@ -163,7 +164,7 @@ def sample_by_nuts(
 
         mcmc = MCMC(
             kernel, num_warmup=warmup, num_samples=draws, num_chains=chains,
-            chain_method="vectorized", progress_bar=progress,
+            chain_method="vectorized", progress_bar=progress and shows_bars(),
         )  # fmt: skip
         mcmc.run(jax.random.key(seed), init_params=starts, extra_fields=tuple(_FIELDS))
 

@@ -92,9 +92,14 @@ class ContactRate(dist.Distribution):
         """
         u = jnp.asarray(drift, float)
         if u.ndim != 3:
+            remedy = ""
+            if u.ndim == 2:
+                remedy = (
+                    " For one mission, give drift[None]. If the axis of the robots is missing, add "
+                    "it: drift[..., None] + jnp.zeros(n_robots)."
+                )
             raise TrustboError(
-                f"drift must have the shape (mission, bound, robot); got {u.shape}. For one "
-                "mission, give drift[None]."
+                f"drift must have the shape (mission, bound, robot); got {u.shape}.{remedy}"
             )
 
         n_robots = u.shape[2]

@@ -11,8 +11,10 @@ from trustbo.workspace.moves import bounds_along
 
 RATES = "contact_rate"
 """Name of the site, and of the input, with the contact rates."""
-NAMES = ("awareness", RATES, "n_ticks", "duration", "cell", "bound", "observations")
+NAMES = ("awareness", RATES, "n_ticks", "duration", "cell", "bound", "features", "observations")
 """Names of all inputs; `observations` are all data as `Observations`, without padding."""
+_NOT_ARRAYS = ("features", "observations")
+"""Inputs that compiled functions cannot take as arguments."""
 _STEP_OF_BOUNDS = 8
 """Bounds are padded to a multiple of this number, so that few shapes are compiled."""
 _FEWEST_MISSIONS = 4
@@ -25,13 +27,18 @@ Data = Mapping[str, Any]
 
 The shapes are awareness (mission, bound, robot, feature); contact_rate, n_ticks and duration
 (mission, bound, robot); cell (mission, bound, 2), with rows and columns; and bound (mission, bound,
-3), with moves, rows and columns.
+3), with moves, rows and columns. `features` are the names of the features.
 """
+
+
+def arrays_of(data: Data) -> dict[str, Any]:
+    """Return the inputs that are arrays, which have the leading axes (mission, bound)."""
+    return {name: values for name, values in data.items() if name not in _NOT_ARRAYS}
 
 
 def data_of(
     missions: Sequence[Mission], observations: Observations, *, moves: bool = True
-) -> dict[str, np.ndarray]:
+) -> dict[str, Any]:
     """Return the inputs of missions, padded so that a function is compiled for few shapes.
 
     In the padding, contact_rate is NaN, indices are -1, and the other inputs are 0, because a drift
@@ -68,10 +75,13 @@ def data_of(
         "duration": padded(duration, 0.0),
         "cell": padded(bound[..., 1:], _UNKNOWN),
         "bound": padded(bound, _UNKNOWN),
+        "features": tuple(missions[0].features),
     }
 
 
-def data_of_bounds(awareness: np.ndarray, bounds: np.ndarray) -> dict[str, np.ndarray]:
+def data_of_bounds(
+    awareness: np.ndarray, bounds: np.ndarray, features: Sequence[str]
+) -> dict[str, Any]:
     """Return the inputs of bounds as one mission without contact rates, padded as in `data_of`.
 
     The number of ticks and the duration, which are not known before a mission, are NaN.
@@ -79,6 +89,7 @@ def data_of_bounds(awareness: np.ndarray, bounds: np.ndarray) -> dict[str, np.nd
     Args:
         awareness: Awareness, shape (bound, robot, feature), without NaN.
         bounds: Moves, rows and columns, shape (bound, 3).
+        features: Names of the features.
     """
     n_bounds, n_robots, n_features = awareness.shape
     n_padded = n_bounds + -n_bounds % _STEP_OF_BOUNDS
@@ -96,12 +107,13 @@ def data_of_bounds(awareness: np.ndarray, bounds: np.ndarray) -> dict[str, np.nd
         "duration": unmeasured,
         "cell": indices[..., 1:],
         "bound": indices,
+        "features": tuple(features),
     }
 
 
-def observations_of(data: Data, features: tuple[str, ...]) -> Observations:
+def observations_of(data: Data) -> Observations:
     """Return inputs as `Observations`."""
-    return Observations(data[RATES], data["awareness"], data["n_ticks"], features)
+    return Observations(data[RATES], data["awareness"], data["n_ticks"], data["features"])
 
 
 def _power_of_two(n: int) -> int:

@@ -8,7 +8,12 @@ import jax
 import numpy as np
 
 from trustbo.errors import TrustboError
-from trustbo.inference.functions.data import Data, data_of_bounds, observations_of
+from trustbo.inference.functions.data import (
+    Data,
+    arrays_of,
+    data_of_bounds,
+    observations_of,
+)
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.models.backend import own_settings
 from trustbo.models.draws import Draws
@@ -207,9 +212,9 @@ class FunctionDraws(Draws):
 
     def _data(self, z: np.ndarray, bounds: np.ndarray) -> dict[str, Any]:
         """Return the inputs of bounds; `z` has the shape (bound, robot, feature)."""
-        data: dict[str, Any] = data_of_bounds(z, bounds)
+        data = data_of_bounds(z, bounds, self.features)
         if self.model.needs_observations:
-            data["observations"] = observations_of(data, self.features)
+            data["observations"] = observations_of(data)
         return data
 
     def _flat_values(self) -> dict[str, np.ndarray]:
@@ -243,11 +248,10 @@ class FunctionDraws(Draws):
 
         order = np.random.default_rng(0).permutation(len(z))[: max(1, len(z) // 2)]
         data = some._data(z[order], bounds[order])
-        data.pop("observations", None)
         n_half = data["awareness"].shape[1] // 2
-        data = {name: v[0].reshape(2, n_half, *v.shape[2:]) for name, v in data.items()}
+        data |= {n: v[0].reshape(2, n_half, *v.shape[2:]) for n, v in arrays_of(data).items()}
         if some.model.needs_observations:
-            data["observations"] = observations_of(data, some.features)
+            data["observations"] = observations_of(data)
         sites = some.model.sites(data)
         if any(
             shapes.get(name) != site.shape for name, site in sites.items() if name in self.values

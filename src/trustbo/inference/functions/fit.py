@@ -12,11 +12,12 @@ from trustbo.data import Mission
 from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, require_kind, warn
-from trustbo.inference.diagnostics import MAX_RHAT, complaints_of
+from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of
 from trustbo.inference.draws import joined_draws
 from trustbo.inference.functions.data import (
     RATES,
     Data,
+    arrays_of,
     data_of,
     data_of_bounds,
     observations_of,
@@ -122,14 +123,8 @@ def fit_function(
     stats = {ours: samples.fields[theirs] for theirs, ours in _STATS.items()}
     stats["lp"] = -stats["lp"]  # NumPyro's potential is -log density
 
-    values = _constrained(model, data, samples)
-    by_chain = {name: v.reshape(*stats["lp"].shape, *v.shape[1:]) for name, v in values.items()}
-
     n_missions = len(missions)
-    variables = {
-        name: _without_padding(values, sites[name], n_missions) for name, values in by_chain.items()
-    }
-    tree = _tree(model, variables, sites, stats, missions, data, seed)
+    tree = _tree(model, _constrained(model, data, samples), sites, stats, missions, data, seed)
     tree.attrs |= {
         "model": model.name,
         "model_record": model.text,
@@ -146,26 +141,41 @@ def fit_function(
         **{f"{name}_version": version for name, version in VERSIONS.items()},
     }
 
+    if not verdict.complaints:
+        _warn(model, verdict, stats["diverging"].size)
+    return tree, verdict.complaints
+
+
+def _warn(model: FunctionModel, verdict: "Verdict", n_transitions: int) -> None:
+    """Warn of what was accepted although it is outside the limits."""
     n_diverged = int(verdict.diagnostics["divergences"])
-    if n_diverged and not verdict.complaints:
-        warn(
-            f"{n_diverged} of {stats['diverging'].size} transitions diverged, even with small "
-            f"steps: draws of {model.in_short()} may miss narrow parts of the posterior. Narrower "
-            "priors or another parametrisation help."
-        )
     r_hat = verdict.diagnostics["r_hat"]
-    if r_hat > MAX_RHAT and not verdict.complaints:
+    ess = verdict.diagnostics["ess_bulk"]
+    is_rough = r_hat > MAX_RHAT or ess < MIN_ESS
+
+    if n_diverged:
+        warn(
+            f"{n_diverged} of {n_transitions} transitions diverged, even with small steps: draws "
+            f"of {model.in_short()} may miss narrow parts of the posterior. Narrower priors or "
+            "another parametrisation help."
+        )
+    if is_rough:
         warn(
             f"the posterior of {model.in_short()} is rough: R-hat of its drift and noises is "
-            f"{r_hat:.3f}, bulk ESS {verdict.diagnostics['ess_bulk']:.0f}. More draws and warmup, "
-            "narrower priors or fewer variables help."
+            f"{r_hat:.3f}, bulk ESS {ess:.0f}. More draws and warmup, narrower priors or fewer "
+            "variables help."
         )
     if verdict.not_identified:
-        warn(
-            f"the chains of {joined_names(verdict.not_identified)} differ, but those of the drift "
-            "and noises agree: plans and predictions can be used, these variables cannot."
-        )
-    return tree, verdict.complaints
+        names = joined_names(verdict.not_identified)
+        chains = f"the chains of {names} differ or have too few draws"
+        if is_rough:
+            text = f"{chains}, even under the wider limits of a rough posterior: do not interpret"
+            warn(f"{text} these variables.")
+        else:
+            warn(
+                f"{chains}, but those of the drift and noises agree: plans and predictions can be "
+                "used, these variables cannot."
+            )
 
 
 def with_latent_of_function(
@@ -348,9 +358,9 @@ def prior_draws_of_function(
 ) -> FunctionDraws:
     """Draw the variables of a function from the prior, for the bounds of a workspace."""
     awareness = workspace.awareness.values
-    n_robots, _, rows, cols, n_features = awareness.shape
+    n_robots, _, rows, cols, _ = awareness.shape
     features = tuple(workspace.features)
-    data = _nothing(model, n_robots, n_features, features)
+    data = _nothing(model, n_robots, features)
     sites = model.sites(data)
 
     drawn = model.over_draws("prior", 1, data)(_keys(n_draws, seed))
@@ -387,21 +397,20 @@ def _data_for(
     model: FunctionModel, missions: Sequence[Mission], observations: Observations
 ) -> dict[str, Any]:
     """Return the inputs of a function; data that it takes as one object are not padded."""
-    data: dict[str, Any] = data_of(missions, observations, moves="bound" in model.inputs)
+    data = data_of(missions, observations, moves="bound" in model.inputs)
     if model.needs_observations:
         n_missions, n_bounds = observations.contact_rate.shape[:2]
-        data = {name: values[:n_missions, :n_bounds] for name, values in data.items()}
+        data |= {name: v[:n_missions, :n_bounds] for name, v in arrays_of(data).items()}
         data["observations"] = observations
     return data
 
 
-def _nothing(
-    model: FunctionModel, n_robots: int, n_features: int, features: tuple[str, ...]
-) -> dict[str, Any]:
+def _nothing(model: FunctionModel, n_robots: int, features: tuple[str, ...]) -> dict[str, Any]:
     """Return the inputs of one mission of one bound without contact rates."""
-    data: dict[str, Any] = data_of_bounds(np.zeros((1, n_robots, n_features)), np.full((1, 3), -1))
+    z = np.zeros((1, n_robots, len(features)))
+    data = data_of_bounds(z, np.full((1, 3), -1), features)
     if model.needs_observations:
-        data["observations"] = observations_of(data, features)
+        data["observations"] = observations_of(data)
     return data
 
 
@@ -439,14 +448,19 @@ def _judge(
         return Verdict(found, complaints, [])
 
     used = _used_by_plans(model, data, samples)
-    limits = {"max_rhat": _ROUGH_RHAT, "min_ess": _ROUGH_ESS} if last else {}
-    found, complaints = complaints_of(used, diverging, max_divergences=most, **limits)
+    limits: dict[str, Any] = {"max_divergences": most}
+    if last:
+        limits |= {"max_rhat": _ROUGH_RHAT, "min_ess": _ROUGH_ESS}
+    found, complaints = complaints_of(used, diverging, **limits)
     if complaints:
         return Verdict(found, complaints, [])
 
+    # A variable that is itself a noise has the same chains, so it passes the same limits.
+    values = _constrained(model, data, samples)
+    shape = diverging.shape
     alone = {
-        name: complaints_of({name: v}, diverging, max_divergences=most)[1]
-        for name, v in samples.z.items()
+        name: complaints_of({name: v.reshape(*shape, -1)}, diverging, **limits)[1]
+        for name, v in values.items()
     }
     return Verdict(found, [], [name for name, failed in alone.items() if failed])
 
@@ -468,7 +482,13 @@ def _used_by_plans(model: FunctionModel, data: Data, samples: Samples) -> dict[s
     some = measured[np.linspace(0, len(measured) - 1, min(_CHECKED, len(measured))).astype(int)]
     drift = (inputs.drift + inputs.offset).reshape(n_draws, -1)[:, some]
 
-    used = {"drift": drift} | {n: v for n, v in space._asdict().items() if v is not None}
+    used = {"drift": drift}
+    for name, value in space._asdict().items():
+        if value is None:
+            continue
+        # A variance is judged as the sd that the user gave: R-hat differs between the two.
+        is_variance = name.endswith("_cov") and value.shape[-1] == 1
+        used[name] = np.sqrt(value) if is_variance else value
     return {name: v.reshape(*shape, -1) for name, v in used.items()}
 
 
@@ -496,10 +516,16 @@ def _sampled(
     """
     sampler = _sampler(model)
     accept = _ACCEPT
+    n_diverged = 0
     runs: list[Samples] = []
     most = min(max(_ATTEMPTS, _MANY // draws), _MOST_ATTEMPTS) if check else 1
     attempt = 0
     while True:
+        title = f"NUTS, run {attempt + 1}"
+        if most > 1:
+            title += f" of at most {most}"
+        if n_diverged:
+            title += f" ({n_diverged} divergences in the last run)"
         last = sampler.sample(
             data,
             sites,
@@ -509,9 +535,11 @@ def _sampled(
             accept=accept,
             seed=int(np.random.SeedSequence([seed, attempt]).generate_state(1)[0]),
             progress=progress,
+            title=title,
         )
         attempt += 1
         patient = attempt >= _PATIENT
+        n_diverged = int(last.fields["diverging"].sum())
         share = last.fields["diverging"].mean()
         is_bad = share > (_TOLERATED if patient else 0.0)
         if is_bad:
@@ -652,43 +680,92 @@ def _prior_predictive(
 
 def _tree(
     model: FunctionModel,
-    variables: Mapping[str, np.ndarray],
+    values: Mapping[str, np.ndarray],
     sites: Mapping[str, Site],
     stats: Mapping[str, np.ndarray],
     missions: Sequence[Mission],
     data: Data,
     seed: int,
 ) -> xr.DataTree:
-    """Build a DataTree from draws, statistics, prior draws and the data."""
-    sizes = _sizes_of_axes(missions)
-    dims = {}
-    for name, site in sites.items():
-        shape = variables[name].shape[2:]
-        dims[safe(name)] = tuple(
-            dim if sizes.get(dim, n) == n else f"{safe(name)}_{dim}"
-            for dim, n in zip(site.dims, shape, strict=True)
-        )
+    """Build a DataTree from draws (draw, ...) of the variables, statistics (chain, draw) and data.
 
+    The groups `posterior` and `prior` include sites of `numpyro.deterministic`.
+    """
+    computed = model.computed_sites(data)
+    stored = {**sites, **computed}
     prior = model.over_draws("prior", 1, data)(_keys(N_PRIOR, seed + 2))
-    prior = {
-        name: _without_padding(prior[name][None], site, len(missions))
-        for name, site in sites.items()
-    }
+
+    def by_chain(values: Mapping[str, np.ndarray], shape: tuple[int, ...]) -> dict[str, Any]:
+        whole = {**values, **_computed(model, values, computed, data)}
+        arrays = {name: whole[name].reshape(*shape, *whole[name].shape[1:]) for name in stored}
+        return {
+            safe(name): _without_padding(array, stored[name], len(missions))
+            for name, array in arrays.items()
+        }
+
     groups = {
-        "posterior": {safe(name): values for name, values in variables.items()},
+        "posterior": by_chain(values, stats["lp"].shape),
         "sample_stats": dict(stats),
-        "prior": {safe(name): values for name, values in prior.items()},
+        "prior": by_chain(prior, (1, N_PRIOR)),
     }
+    shapes = {name: groups["posterior"][safe(name)].shape[2:] for name in stored}
+    sizes = _sizes_of_axes(missions)
+    dims = _dims_of(stored, shapes, sizes)
     labels = {
-        dim: np.arange(variables[name].shape[2 + axis])
-        for name in sites
-        for axis, dim in enumerate(dims[safe(name)])
+        dim: np.arange(n)
+        for name in stored
+        for dim, n in zip(dims[safe(name)], shapes[name], strict=True)
         if dim not in sizes
     }
     tree = to_datatree(groups, missions, dims, labels=labels)
     common = [name for name, site in sites.items() if site.mission_axis is None]
     tree["posterior"].attrs["common"] = json.dumps(common)
     return tree
+
+
+def _computed(
+    model: FunctionModel, values: Mapping[str, np.ndarray], sites: Mapping[str, Site], data: Data
+) -> dict[str, np.ndarray]:
+    """Compute the sites of `numpyro.deterministic` at values (draw, ...) of the variables."""
+    if not sites:
+        return {}
+
+    n_draws = len(next(iter(values.values())))
+    keys = _keys(n_draws, 0)
+    compute = model.over_draws("deterministic", 2, data)
+    parts = []
+    for begin in range(0, n_draws, _SIZE):  # sites that are left out may be large
+        some = slice(begin, begin + _SIZE)
+        found = compute({name: v[some] for name, v in values.items()}, keys[some])
+        parts.append({name: found[name] for name in sites})
+    return {name: np.concatenate([part[name] for part in parts]) for name in sites}
+
+
+def _dims_of(
+    sites: Mapping[str, Site], shapes: Mapping[str, tuple[int, ...]], sizes: Mapping[str, int]
+) -> dict[str, tuple[str, ...]]:
+    """Return the names of the axes of variables, by name.
+
+    A plate whose name is that of an axis of posteriors, but which has another size, or whose name
+    is that of a variable, has the suffix `_plate`.
+    """
+    taken = {"chain", "draw", "bound", *map(safe, sites)}
+    known: dict[str, int] = {}
+
+    def label(name: str, dim: str, n: int) -> str:
+        own = safe(dim)
+        if own in taken or sizes.get(own, n) != n:
+            own = f"{own}_plate"
+        if known.setdefault(own, n) != n:  # two plates with one name
+            own = f"{safe(name)}_{own}"
+        return own
+
+    return {
+        safe(name): tuple(
+            label(name, dim, n) for dim, n in zip(site.dims, shapes[name], strict=True)
+        )
+        for name, site in sites.items()
+    }
 
 
 def _sizes_of_axes(missions: Sequence[Mission]) -> dict[str, int]:

@@ -6,9 +6,10 @@ import hashlib
 import inspect
 import json
 import pickle
+import re
 import textwrap
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from types import CodeType
 from typing import Any, NamedTuple
@@ -17,13 +18,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
-from numpyro.distributions import Distribution, biject_to
+from numpyro.distributions import (
+    Distribution,
+    ExpandedDistribution,
+    Independent,
+    MaskedDistribution,
+    biject_to,
+)
 from numpyro.infer.util import constrain_fn, potential_energy
 from numpyro.primitives import Messenger
 
 from trustbo.display import joined
 from trustbo.errors import TrustboError
-from trustbo.inference.functions.data import NAMES, RATES, Data
+from trustbo.inference.functions.data import NAMES, RATES, Data, arrays_of, observations_of
 from trustbo.models.backend import own_settings
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.model import TrustModel
@@ -40,12 +47,16 @@ _MOST_KNOWN = 64
 """Number of functions that are remembered, with what was compiled for them."""
 _AXES = ("chain", "draw")
 """Names that no variable may have."""
+_OF_SHAPES = re.compile("ncompatible shapes|could not be broadcast|not broadcast")
+"""Errors of JAX and NumPy about shapes that do not fit each other."""
+_FROM_REPARAM = ("_decentered", "_base")
+"""Suffixes of the latent variable to which a reparametrisation of NumPyro moves the plates."""
 _HASH_LENGTH = 16
 """Number of hexadecimal digits of a hash."""
 
 
 class Site(NamedTuple):
-    """Latent variable of a function."""
+    """Latent variable of a function, or a site of `numpyro.deterministic`."""
 
     dims: tuple[str, ...]
     """Names of its axes: those of its plates, and `name_dim_0` and so on for others."""
@@ -53,7 +64,7 @@ class Site(NamedTuple):
     """Axis that runs over missions; None if the variable is common to all missions."""
     shape: tuple[int, ...]
     n_free: int
-    """Number of its coordinates in unconstrained space."""
+    """Number of its coordinates in unconstrained space; 0 if it is no latent variable."""
 
 
 class Found(NamedTuple):
@@ -77,7 +88,7 @@ class FunctionModel:
     Attributes:
         function: The function.
         inputs: Names of the inputs that it takes; see `data.NAMES`.
-        compiled: Methods that were compiled for draws, by name.
+        compiled: Methods that were compiled for draws, by name and features.
         sampler: `nuts.Sampler` of the function, once there is one.
     """
 
@@ -89,11 +100,12 @@ class FunctionModel:
                 `contact_rate` is not among the parameters.
         """
         self.function = function
-        self.name = getattr(function, "__name__", type(function).__name__)
+        self.name = _name_of(function)
         self.inputs = _inputs_of(function, self.name)
         self.fingerprint = fingerprint(function)
-        self.compiled: dict[str, Callable[..., Any]] = {}
+        self.compiled: dict[tuple[str, tuple[str, ...]], Callable[..., Any]] = {}
         self.sampler: Any = None
+        self._in_range: set[tuple[str, ...]] = set()  # features that were checked
 
     @property
     def family(self) -> str:
@@ -135,6 +147,44 @@ class FunctionModel:
             TrustboError: If the function fails, or has no site `contact_rate` with a `ContactRate`
                 of the shape of the missions, or a variable is discrete, or there is none.
         """
+        trace, free = self._shapes(data)
+        if not free:
+            raise TrustboError(f"{self.in_short()} has no latent variable to learn; sample one.")
+
+        self._require_features_in_range(data)
+        plates = _plates_of_rates(trace)
+        return {name: _site(trace[name], free[name], plates) for name in free}
+
+    def computed_sites(self, data: Data) -> dict[str, Site]:
+        """Return the sites of `numpyro.deterministic` by name, without those that have bounds.
+
+        The function runs, without computing anything, on twice as many missions and bounds. An axis
+        whose length then changes is that of missions or bounds.
+        """
+        trace, _ = self._shapes(data)
+        names = [name for name, site in trace.items() if site["type"] == "deterministic"]
+        if not names:
+            return {}
+
+        try:
+            more_missions, more_bounds = (self._shapes(_doubled(data, n))[0] for n in (0, 1))
+        except TrustboError:  # the function is made for this number of missions and bounds
+            more_missions = more_bounds = trace
+        plates = _plates_of_rates(trace)
+        sites = {}
+        for name in names:
+            if _axes_that_differ(trace[name], more_bounds[name]):
+                continue
+            axes = _axes_that_differ(trace[name], more_missions[name])
+            sites[name] = _computed_site(trace, name, plates, axes[0] if axes else None)
+        return sites
+
+    def _shapes(self, data: Data) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Trace the function with abstract values.
+
+        Returns:
+            The trace, and the shapes of the latent variables in unconstrained space, by name.
+        """
         trace: dict[str, Any] = {}
 
         def run(key: jax.Array, arrays: dict[str, Any]) -> dict[str, Any]:
@@ -146,17 +196,44 @@ class FunctionModel:
                 for name in _latent(found)
             }
 
-        with own_settings(), _explained(self):
-            arrays = {name: values for name, values in data.items() if name != "observations"}
+        with own_settings(), _explained(self, data):
+            arrays = arrays_of(data)
             if self.needs_observations:  # its arrays must not be abstract
                 arrays = {}
             free = jax.eval_shape(run, jax.random.key(0), arrays)
+        return trace, free
 
-        if not free:
-            raise TrustboError(f"{self.in_short()} has no latent variable to learn; sample one.")
+    def _require_features_in_range(self, data: Data) -> None:
+        """Raise TrustboError if the function reads a feature that awareness does not have.
 
-        plates = {frame.name for frame in trace[RATES]["cond_indep_stack"]}
-        return {name: _site(trace[name], free[name], plates) for name in free}
+        JAX returns the last feature instead of an error. NumPy raises an error, so the function
+        runs once with awareness as an array of NumPy. Other errors mean that it needs one of JAX.
+        """
+        features = data["features"]
+        if features in self._in_range:
+            return
+        self._in_range.add(features)
+        n_features = np.shape(data["awareness"])[-1]
+        of_features = f"is out of bounds for axis 3 with size {n_features}"
+
+        def run(key: jax.Array) -> None:
+            handlers.seed(self.call, key)({**data, "awareness": np.asarray(data["awareness"])})
+
+        try:
+            with own_settings():
+                jax.eval_shape(run, jax.random.key(0))
+        except IndexError as error:
+            if of_features not in str(error):
+                return
+            places = [f"{name} ({m})" for m, name in enumerate(features)]
+            self._in_range.discard(features)
+            raise TrustboError(
+                f"{self.in_short()} reads a feature that awareness does not have: {error}. The "
+                f"features are {joined(places)}; a function that takes the input features can "
+                "use awareness[..., features.index(name)]."
+            ) from error
+        except Exception:
+            return
 
     def _require_rates(self, trace: Mapping[str, Any], data: Data) -> None:
         """Raise TrustboError unless the site `contact_rate` is the state space of the missions."""
@@ -168,6 +245,8 @@ class FunctionModel:
 
         rates = site["fn"]
         if not isinstance(rates, ContactRate):
+            while isinstance(rates, ExpandedDistribution | Independent | MaskedDistribution):
+                rates = rates.base_dist
             raise TrustboError(
                 f"the site 'contact_rate' of {self.in_short()} has the distribution "
                 f"{type(rates).__name__}; it must be tb.models.ContactRate. {_HOW}"
@@ -181,20 +260,24 @@ class FunctionModel:
         shape = np.shape(data[RATES])
         given = (*rates.batch_shape, *rates.event_shape)
         if given != shape:
+            remedy = ""
+            if given[2] == 1:
+                remedy = " Add the axis of the robots: drift + jnp.zeros(awareness.shape[:3])."
             raise TrustboError(
                 f"the drift of {self.in_short()} must have the shape (mission, bound, robot) = "
                 f"{shape}, as awareness is (mission, bound, robot, feature) = "
-                f"{np.shape(data['awareness'])}; got {given}."
+                f"{np.shape(data['awareness'])}; got {given}.{remedy}"
             )
 
         for name, one in trace.items():
             free = one["type"] == "sample" and not one["is_observed"]
+            named = free or one["type"] == "deterministic"
             if free and one["fn"].support.is_discrete:
                 raise TrustboError(
                     f"the site {name!r} of {self.in_short()} is discrete, and NUTS samples "
                     "continuous variables only; sum over its values."
                 )
-            if free and name in _AXES:
+            if named and name in _AXES:
                 raise TrustboError(
                     f"the site {name!r} of {self.in_short()} has the name of an axis of "
                     "posteriors; give it another name."
@@ -219,6 +302,13 @@ class FunctionModel:
         """Draw the variables from the prior."""
         trace = self._trace({}, key, data)
         return {name: trace[name]["value"] for name in _latent(trace)}
+
+    def deterministic(
+        self, values: Mapping[str, Any], key: jax.Array, data: Data
+    ) -> dict[str, Any]:
+        """Compute the sites of `numpyro.deterministic` at given values of the variables."""
+        trace = self._trace(values, key, data)
+        return {n: site["value"] for n, site in trace.items() if site["type"] == "deterministic"}
 
     def evaluate(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> Found:
         """Run the function with given values of its variables; others are drawn from the prior."""
@@ -255,37 +345,58 @@ class FunctionModel:
             data: Inputs.
         """
         axes = (*(0,) * n_draw_axes, None)
+        compute = getattr(self, method)
         if self.needs_observations:
-            of_data = getattr(self, method)
-            mapped = jax.jit(jax.vmap(lambda *draws: of_data(*draws, data)))
-            return lambda *draws: self._called(mapped, draws)
+            mapped = jax.jit(jax.vmap(lambda *draws: compute(*draws, data)))
+            return lambda *draws: self._called(mapped, draws, data)
 
-        if method not in self.compiled:
-            self.compiled[method] = jax.jit(jax.vmap(getattr(self, method), in_axes=axes))
-        mapped = self.compiled[method]
-        arrays = {name: np.asarray(data[name]) for name in (*self.inputs, RATES)}
-        return lambda *draws: self._called(mapped, (*draws, arrays))
+        features = data["features"]
+        known = method, features
+        if known not in self.compiled:
 
-    def _called(self, compiled: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+            def of_arrays(*arguments: Any) -> Any:
+                *draws, arrays = arguments
+                return compute(*draws, {**arrays, "features": features})
+
+            self.compiled[known] = jax.jit(jax.vmap(of_arrays, in_axes=axes))
+        mapped = self.compiled[known]
+        needed = (*self.inputs, RATES)
+        arrays = {n: np.asarray(v) for n, v in arrays_of(data).items() if n in needed}
+        return lambda *draws: self._called(mapped, (*draws, arrays), data)
+
+    def _called(self, compiled: Callable[..., Any], arguments: tuple[Any, ...], data: Data) -> Any:
         """Call a compiled function with the settings and messages of this module."""
-        with own_settings(), _explained(self):
+        with own_settings(), _explained(self, data):
             return jax.tree.map(np.asarray, compiled(*arguments))
 
 
 class _explained:  # noqa: N801
     """Context in which an error in a user's function says which function failed."""
 
-    def __init__(self, model: FunctionModel) -> None:
+    def __init__(self, model: FunctionModel, data: Data) -> None:
         self.model = model
+        self.data = data
 
     def __enter__(self) -> None:
         pass
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, Exception) and not isinstance(error, TrustboError):
-            text = str(error).strip().splitlines() or [""]
+        who = self.model.in_short()
+        if isinstance(error, TrustboError):
+            if who not in str(error):
+                raise TrustboError(f"{who}: {error}") from error
+        elif isinstance(error, Exception):
+            text = (str(error).strip().splitlines() or [""])[0]
+            remedy = ""
+            if _OF_SHAPES.search(text):
+                remedy = (
+                    f" Awareness has the shape (mission, bound, robot, feature) = "
+                    f"{np.shape(self.data['awareness'])}, and the drift must be (mission, bound, "
+                    "robot). Use a variable of a mission as variable[:, None, None], and one of a "
+                    "robot as it is."
+                )
             raise TrustboError(
-                f"{self.model.in_short()} failed with {type(error).__name__}: {text[0]}"
+                f"{who} failed with {type(error).__name__}: {text}{remedy}"
             ) from error
 
 
@@ -386,20 +497,85 @@ def _latent(trace: Mapping[str, Any]) -> list[str]:
 def _site(site: Mapping[str, Any], free: Any, plates: set[str]) -> Site:
     """Describe a latent variable; `plates` are those of the contact rates."""
     shape = np.shape(site["value"])
-    n_event = len(site["fn"].event_shape)
-    n_batch = len(shape) - n_event
-    dims = [f"{site['name']}_dim_{i}" for i in range(len(shape))]
+    n_batch = len(shape) - len(site["fn"].event_shape)
+    axes = _axes_of_plates(shape, n_batch, site["cond_indep_stack"])
+    dims, mission_axis = _dims(site["name"], shape, axes, plates)
+    return Site(dims, mission_axis, shape, int(np.prod(np.shape(free))))
+
+
+def _computed_site(
+    trace: Mapping[str, Any], name: str, plates: set[str], mission_axis: int | None
+) -> Site:
+    """Describe a site of `numpyro.deterministic`; `mission_axis` is that of all missions, if known.
+
+    NumPyro does not know how many of its axes belong to an event. The fewest for which the plates
+    have the right sizes are assumed.
+    """
+    shape = np.shape(trace[name]["value"])
+    stacks = [trace.get(f"{name}{suffix}", {}) for suffix in ("", *_FROM_REPARAM)]
+    stack = next((s["cond_indep_stack"] for s in stacks if s.get("cond_indep_stack")), [])
+
+    axes: dict[int, str] = {}
+    for n_event in range(len(shape)):
+        axes = _axes_of_plates(shape, len(shape) - n_event, stack)
+        if len(axes) == len(stack):
+            break
+    dims, _ = _dims(name, shape, axes, plates)
+    if mission_axis is not None:
+        dims = (*dims[:mission_axis], "mission", *dims[mission_axis + 1 :])
+    return Site(dims, mission_axis, shape, 0)
+
+
+def _axes_of_plates(shape: tuple[int, ...], n_batch: int, stack: Sequence[Any]) -> dict[int, str]:
+    """Return the names of plates by the axis of an array that has the size of the plate."""
+    axes = {n_batch + frame.dim: frame for frame in stack}  # `dim` counts from the last axis
+    return {
+        axis: frame.name
+        for axis, frame in axes.items()
+        if 0 <= axis < n_batch and shape[axis] == frame.size
+    }
+
+
+def _dims(
+    name: str, shape: tuple[int, ...], axes: Mapping[int, str], plates: set[str]
+) -> tuple[tuple[str, ...], int | None]:
+    """Return the names of the axes of a variable, and the axis that runs over missions."""
+    dims = [axes.get(axis, f"{name}_dim_{axis}") for axis in range(len(shape))]
     mission_axis = None
-
-    for frame in site["cond_indep_stack"]:
-        axis = n_batch + frame.dim  # `dim` counts from the last axis of the batch
-        if not 0 <= axis < n_batch or shape[axis] != frame.size:
-            continue
-        dims[axis] = "mission" if frame.name in plates else frame.name
-        if frame.name in plates:
+    for axis, plate in axes.items():
+        if plate in plates:
+            dims[axis] = "mission"
             mission_axis = axis
+    return tuple(dims), mission_axis
 
-    return Site(tuple(dims), mission_axis, shape, int(np.prod(np.shape(free))))
+
+def _plates_of_rates(trace: Mapping[str, Any]) -> set[str]:
+    """Return the names of the plates of the contact rates, which are plates of missions."""
+    return {frame.name for frame in trace[RATES]["cond_indep_stack"]}
+
+
+def _doubled(data: Data, axis: int) -> dict[str, Any]:
+    """Return inputs with twice as many missions (axis 0) or bounds (axis 1)."""
+    arrays = {name: np.concatenate([v, v], axis) for name, v in arrays_of(data).items()}
+    more = {**data, **arrays}
+    if "observations" in data:
+        more["observations"] = observations_of(more)
+    return more
+
+
+def _axes_that_differ(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[int]:
+    """Return the axes in which the values of two sites differ in length."""
+    shapes = zip(np.shape(one["value"]), np.shape(other["value"]), strict=True)
+    return [axis for axis, (n, m) in enumerate(shapes) if n != m]
+
+
+def _name_of(function: Any) -> str:
+    """Return the name of a function, also of one in `functools.partial` or a handler."""
+    if isinstance(function, functools.partial) and not hasattr(function, "__name__"):
+        return _name_of(function.func)
+    if isinstance(function, Messenger) and function.fn is not None:
+        return _name_of(function.fn)
+    return getattr(function, "__name__", type(function).__name__)
 
 
 # --- what identifies a function ---

@@ -19,7 +19,7 @@ from numpyro.infer.hmc import hmc
 
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError
-from trustbo.inference.functions.data import Data
+from trustbo.inference.functions.data import Data, arrays_of
 from trustbo.inference.functions.function import FunctionModel, Site
 from trustbo.models.backend import own_settings
 
@@ -92,6 +92,7 @@ class Sampler:
         accept: float,
         seed: int,
         progress: bool,
+        title: str = "NUTS",
     ) -> Samples:
         """Sample from the posterior.
 
@@ -104,18 +105,20 @@ class Sampler:
             accept: Target of the acceptance probability.
             seed: Random seed.
             progress: Whether to show the seconds after 5 seconds.
+            title: What to show before them.
 
         Raises:
             TrustboError: If no candidate has a finite density.
         """
-        with own_settings(), slow_bar("NUTS", " s", progress) as bar, ticking(bar):
+        with own_settings(), slow_bar(title, " s", progress) as bar, ticking(bar):
             free = free_shapes(self.model, sites, data)
             unravel = ravel_pytree(free)[1]
             run = self._run_of(free, unravel, warmup, draws, data)
 
             arrays = {}
             if not self.model.needs_observations:
-                arrays = {name: jnp.asarray(data[name]) for name in self.model.inputs}
+                given = arrays_of(data)
+                arrays = {n: jnp.asarray(v) for n, v in given.items() if n in self.model.inputs}
             keys = jax.random.split(jax.random.key(seed), len(start.x))
             found = run(keys, start.x, start.step_size, start.inverse_mass, accept, arrays)
             x, fields, step_size = jax.tree.map(np.asarray, found)
@@ -140,14 +143,15 @@ class Sampler:
         """Return the compiled function that runs the chains."""
         shapes = tuple((name, np.shape(values)) for name, values in free.items())
         fixed = id(data["observations"]) if self.model.needs_observations else None
-        known = (shapes, warmup, draws, fixed)
+        features = data["features"]
+        known = (shapes, warmup, draws, features, fixed)
         if known in self._compiled:
             return self._compiled[known]
 
         n = sum(int(np.prod(shape)) for _, shape in shapes)
 
         def potential_of(arrays: Data) -> Callable[[Any], Any]:
-            given = data if self.model.needs_observations else arrays
+            given = data if fixed is not None else {**arrays, "features": features}
             return lambda x: self.model.potential(unravel(x), given)
 
         def chain(
