@@ -19,7 +19,12 @@ from scipy import stats
 import trustbo as tb
 from trustbo.errors import PosteriorError
 from trustbo.inference import params_of
-from trustbo.inference.functions.function import as_model, fingerprint
+from trustbo.inference.functions.function import (
+    as_model,
+    constants_of,
+    fingerprint,
+    model_of_record,
+)
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 
 FEATURES = ("traversability", "line_of_sight")
@@ -188,6 +193,42 @@ except tb.TrustboError as error:
     )
     with pytest.raises(tb.TrustboError, match="not of 'other'"):
         params_of(tree, model=functools.update_wrapper(functools.partial(shaped), other))
+
+
+@pytest.mark.parametrize(
+    ("stored", "given", "message"),
+    [
+        ({"n": 2}, {"n": 1}, "'shaped'.* not of 'shaped'.* constant n differs"),
+        ({"n": 2}, {}, "use of functools.partial differs"),  # n is 2 by default
+        ({}, {}, ""),
+    ],
+)
+def test_a_constant_that_differs_is_named(stored, given, message):
+    """A constant is an argument of a partial function here."""
+    record = as_model(functools.partial(shaped, **stored)).record()
+    model = functools.partial(shaped, **given)
+    if stored == given:
+        assert model_of_record(record, model).record() == record
+        return
+    with pytest.raises(tb.TrustboError, match=message):
+        model_of_record(record, model)
+
+
+def test_constants_are_those_of_all_functions_that_are_called():
+    def helper(x, scale=2.0):
+        return scale * x + GLOBAL
+
+    def outer(awareness, contact_rate=None):
+        return helper(awareness)
+
+    before = constants_of(outer)
+    assert set(before) == {"contact_rate", "scale", "GLOBAL"}
+    helper.__defaults__ = (3.0,)
+    after = constants_of(outer)
+    assert [name for name in before if before[name] != after[name]] == ["scale"]
+
+
+GLOBAL = 1.0
 
 
 def other(awareness, contact_rate=None):

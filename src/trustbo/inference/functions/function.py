@@ -128,8 +128,13 @@ class FunctionModel:
         return f"the function {self.name}"
 
     def record(self) -> dict[str, Any]:
-        """Return the name and a hash of the function, for files."""
-        return {"class": KIND, "name": self.name, "sha256": self.fingerprint}
+        """Return the name and a hash of the function and of its constants, for files."""
+        return {
+            "class": KIND,
+            "name": self.name,
+            "sha256": self.fingerprint,
+            "constants": constants_of(self.function),
+        }
 
     @cached_property
     def text(self) -> str:
@@ -437,8 +442,9 @@ def model_of_record(
         if model.record() != dict(record):
             raise TrustboError(
                 f"the posterior is of the function {record['name']!r} with the hash "
-                f"{record['sha256']}, not of {model.name!r} with the hash {model.fingerprint}. "
-                "Give the same function, with the same constants, or fit again."
+                f"{record['sha256']}, not of {model.name!r} with the hash {model.fingerprint}"
+                f"{_difference(model, record)}. Give the same function, with the same constants, "
+                "or fit again."
             )
         return model
 
@@ -449,6 +455,20 @@ def model_of_record(
             "give it with model=."
         )
     return model
+
+
+def _difference(model: FunctionModel, record: Mapping[str, Any]) -> str:
+    """Say which constants of a function are others than in a record, or that the code is."""
+    if model.name != record["name"]:
+        return ""
+
+    own = model.record()["constants"]
+    stored = record.get("constants", {})
+    names = sorted(name for name in {**own, **stored} if own.get(name) != stored.get(name))
+    if not names:
+        return ", whose code or use of functools.partial differs"
+    is_are = "constant" if len(names) == 1 else "constants"
+    return f", whose {is_are} {joined(names)} differ{'s' if len(names) == 1 else ''}"
 
 
 def is_of_function(record: Mapping[str, Any]) -> bool:
@@ -593,6 +613,62 @@ def fingerprint(function: Callable[..., Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:_HASH_LENGTH]
 
 
+def constants_of(function: Callable[..., Any]) -> dict[str, str]:
+    """Return a short hash of each value that a function refers to, by name; see `fingerprint`.
+
+    These are arguments of `functools.partial`, defaults, variables of enclosing functions, and
+    global variables, also of functions of the same module that are called.
+    """
+    found: dict[str, str] = {}
+    _add_constants(function, found, set())
+    return found
+
+
+def _add_constants(function: Any, found: dict[str, str], seen: set[int]) -> None:
+    """Add the values that a function refers to; `seen` has the identities of earlier functions."""
+    if id(function) in seen:
+        return
+    seen.add(id(function))
+
+    values: dict[str, Any] = {}
+    inner: list[Any] = []
+    if isinstance(function, functools.partial):
+        given = {f"argument {n}": value for n, value in enumerate(function.args)}
+        values = {**given, **function.keywords}
+        inner = [function.func]
+    elif isinstance(function, Messenger):
+        inner = [function.fn]
+    elif inspect.ismethod(function):
+        values = {"self": function.__self__}
+        inner = [function.__func__]
+    elif inspect.isfunction(function):
+        values = _values_of(function)
+    elif _is_wrapper(function):
+        inner = [function.__wrapped__]
+
+    for name, value in values.items():
+        if inspect.isroutine(value) or _is_wrapper(value) or isinstance(value, functools.partial):
+            inner.append(value)
+            continue
+        parts: list[str] = []
+        _describe(value, parts, {})
+        found.setdefault(name, hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8])
+    for one in inner:
+        _add_constants(one, found, seen)
+
+
+def _values_of(function: Any) -> dict[str, Any]:
+    """Return the defaults, variables of enclosing functions and globals of a function by name."""
+    parameters = inspect.signature(function, follow_wrapped=False).parameters.values()
+    values = {one.name: one.default for one in parameters if one.default is not one.empty}
+    code = function.__code__
+    cells = function.__closure__ or ()
+    values |= {n: _content(cell) for n, cell in zip(code.co_freevars, cells, strict=True)}
+    names = sorted(_names_in(code) & set(function.__globals__))
+    values |= {name: function.__globals__[name] for name in names if _is_own(function, name)}
+    return values
+
+
 def _describe(value: Any, parts: list[str], seen: dict[int, int]) -> None:
     """Add texts to `parts` that tell a value from others; `seen` numbers the functions so far."""
     if isinstance(value, TrustModel):
@@ -655,17 +731,26 @@ def _describe_global(
     function: Callable[..., Any], name: str, parts: list[str], seen: dict[int, int]
 ) -> None:
     """Describe a global variable that a function refers to; see `fingerprint`."""
-    if name not in function.__globals__:
+    if name not in function.__globals__ or not _is_own(function, name):
         return
 
     value = function.__globals__[name]
-    is_own = getattr(value, "__module__", None) == function.__module__
-    is_function = inspect.isroutine(value) or _is_wrapper(value)
-    if inspect.ismodule(value) or inspect.isclass(value) or (is_function and not is_own):
-        return
-    if not is_function:
+    if not _is_function(value):
         parts.append(name)
     _describe(value, parts, seen)
+
+
+def _is_own(function: Any, name: str) -> bool:
+    """Return whether a global is a value, or a function of the same module as `function`."""
+    value = function.__globals__[name]
+    if inspect.ismodule(value) or inspect.isclass(value):
+        return False
+    return not _is_function(value) or getattr(value, "__module__", None) == function.__module__
+
+
+def _is_function(value: Any) -> bool:
+    """Return whether a value is a function, or wraps one."""
+    return inspect.isroutine(value) or _is_wrapper(value)
 
 
 def _is_wrapper(value: Any) -> bool:
