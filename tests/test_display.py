@@ -69,6 +69,6 @@ def test_a_bar_is_shown_in_a_terminal_but_not_in_a_log(monkeypatch, is_terminal)
     monkeypatch.setattr(sys, "stderr", stream)
     with display.bar(True, desc="missions", total=2) as shown, display.bar(False) as hidden:
         shown.update()
-    assert shown.disable is not is_terminal
-    assert hidden.disable
+        assert hidden.disable
+        assert shown.disable is not is_terminal
     assert ("missions" in stream.getvalue()) == is_terminal

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 from numpyro.handlers import reparam
 from numpyro.infer.reparam import LocScaleReparam
-from numpyro.infer.util import log_density
+from numpyro.infer.util import constrain_fn, log_density, potential_energy
 from scipy import stats
 
 import trustbo as tb
@@ -26,6 +26,7 @@ from trustbo.inference.functions.function import (
     model_of_record,
 )
 from trustbo.models import ContactRate, PooledTrust, TrustParams
+from trustbo.models.backend import own_settings
 
 FEATURES = ("traversability", "line_of_sight")
 
@@ -402,7 +403,10 @@ def broken(awareness, rates):
             refused(out_of_range),
             r"index 2 is out of bounds.*line_of_sight \(1\)",
         ),
-        (refused(without_axes), r"TypeError.*the drift must be \(mission, bound, robot\)"),
+        (
+            refused(without_axes),
+            r"Incompatible shapes.*the drift must be \(mission, bound, robot\)",
+        ),
         (refused(without_robots), r"the function model: drift must .*the axis of the robots"),
         (shaped, r"must have the shape .* = \(4, 8, 3\).*got \(4, 8, 2\)"),
         (lambda z, rates=None: None, "must have the parameters awareness and contact_rate"),
@@ -673,3 +677,50 @@ def test_the_program_of_a_model_class_is_a_function(missions):
     totals = [tree["log_likelihood"]["contact_rate"].sum("mission") for tree in (ours, theirs)]
     means = [float(total.mean()) for total in totals]
     assert abs(means[0] - means[1]) < 0.1 * float(totals[0].std())
+
+
+def test_densities_in_unconstrained_space_are_those_of_numpyro(missions):
+    def model(awareness, contact_rate=None):
+        mix = numpyro.sample("mix", dist.Dirichlet(jnp.ones(2)))
+        with numpyro.plate("robot", 3):
+            scale = numpyro.sample("scale", dist.LogNormal(jnp.zeros(3), 0.3))
+        with numpyro.plate("mission", len(awareness)):
+            noise = numpyro.sample("noise", dist.Beta(2.0, 20.0))
+            drift = awareness @ mix * scale + noise[:, None, None]
+            numpyro.sample("contact_rate", ContactRate(drift, 0.4, 0.1, 0.1), obs=contact_rate)
+
+    n = len(missions)
+    z = {"mix": jnp.array([0.3]), "scale": jnp.array([0.1, -0.4, 0.2]), "noise": jnp.zeros(n)}
+    data = {
+        "awareness": jnp.asarray(np.stack([mission.awareness[:4] for mission in missions])),
+        "contact_rate": jnp.asarray(np.stack([mission.contact_rate[:4] for mission in missions])),
+    }
+    ours = as_model(model)
+    with own_settings():
+        wanted = potential_energy(model, (), data, z)
+        np.testing.assert_allclose(ours.potential(z, data), wanted, rtol=1e-12)
+        wanted = constrain_fn(model, (), data, z)
+        jax.tree.map(np.testing.assert_allclose, ours.constrain(z, data), wanted)
+
+
+@pytest.mark.slow  # a process starts for long
+def test_a_function_is_fitted_if_numpyro_is_half_loaded():
+    """`import arviz, numpyro.distributions` loses submodules of NumPyro, which its NUTS needs."""
+    code = """
+import arviz, numpyro.distributions as dist
+import numpy as np
+import trustbo as tb
+from numpyro import sample
+
+def model(awareness, contact_rate=None):
+    a = sample("a", dist.HalfNormal())
+    rates = tb.models.ContactRate(a * awareness[..., 0], 0.4, 0.05, 0.05)
+    sample("contact_rate", rates, obs=contact_rate)
+
+z = np.random.default_rng(0).uniform(size=(4, 3, 1))
+mission = tb.Mission.from_arrays(None, z, 0.5 * z[..., 0])
+tree = tb.fit([mission], model, draws=100, check=False, latent=False, progress=False)
+print(tree["posterior"]["a"].shape)
+"""
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout == "(4, 100)\n"

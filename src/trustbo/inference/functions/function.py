@@ -25,8 +25,9 @@ from numpyro.distributions import (
     MaskedDistribution,
     biject_to,
 )
-from numpyro.infer.util import constrain_fn, potential_energy
-from numpyro.primitives import Messenger
+from numpyro.distributions.distribution import Unit
+from numpyro.infer.util import log_density
+from numpyro.primitives import Messenger, sample
 
 from trustbo.display import joined
 from trustbo.errors import TrustboError
@@ -292,11 +293,43 @@ class FunctionModel:
 
     def potential(self, z: Mapping[str, Any], data: Data) -> Any:
         """Compute the negative log density at values z of unconstrained space."""
-        return potential_energy(handlers.seed(self.call, 0), (data,), {}, dict(z))
+        log_p, _ = log_density(self._at(z), (data,), {}, {})
+        return -log_p
 
     def constrain(self, z: Mapping[str, Any], data: Data) -> dict[str, Any]:
         """Convert values of unconstrained space to values of the variables."""
-        return constrain_fn(handlers.seed(self.call, 0), (data,), {}, dict(z))
+        trace = handlers.trace(self._at(z)).get_trace(data)
+        return {name: trace[name]["value"] for name in z}
+
+    def _at(self, z: Mapping[str, Any]) -> Callable[..., Any]:
+        """Return the function with values z of unconstrained space, and a factor for each Jacobian.
+
+        `numpyro.infer.util.potential_energy` does the same with `numpyro.factor`, which fails after
+        `import arviz, numpyro.distributions`; see `models.backend`.
+        """
+
+        def value_of(site: Mapping[str, Any]) -> Any:
+            name = site["name"]
+            if site["type"] != "sample" or name not in z:
+                return None
+
+            transform = biject_to(site["fn"].support)
+            x = z[name]
+            n_more = transform.codomain.event_dim - transform.domain.event_dim
+            step = site["infer"].get("_scan_current_index")  # within numpyro.contrib's scan
+            if step is not None and jnp.ndim(x) > len(site["fn"].shape()) - n_more:
+                x = x[step]
+
+            value = transform(x)
+            log_det = transform.log_abs_det_jacobian(x, value)
+            n_event = jnp.ndim(log_det) - jnp.ndim(value) + len(site["fn"].event_shape)
+            log_det = log_det.sum(range(-n_event, 0))
+            factor = Unit(log_det)
+            infer = {"is_auxiliary": True}
+            sample(f"_{name}_log_det", factor, obs=factor.sample(jax.random.key(0)), infer=infer)
+            return value
+
+        return handlers.substitute(handlers.seed(self.call, 0), substitute_fn=value_of)
 
     def unconstrain(self, values: Mapping[str, Any], data: Data) -> dict[str, Any]:
         """Convert values of the variables to values of unconstrained space."""
