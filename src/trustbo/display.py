@@ -93,4 +93,9 @@ def compiling() -> AbstractContextManager[Any]:
 @cache
 def announce() -> None:
     """Print that kernels are being compiled, once per process and above any progress bar."""
-    tqdm.write("compiling kernels (once, about 30 s)", file=sys.stderr)
+    say("compiling kernels (once, about 30 s)")
+
+
+def say(text: str) -> None:
+    """Print a line to stderr, above any progress bar."""
+    tqdm.write(text, file=sys.stderr)

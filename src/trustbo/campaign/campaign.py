@@ -36,7 +36,7 @@ from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import MemoryStorage, Storage
 from trustbo.data import Cell, Mission, path_text
 from trustbo.display import bar as progress_bar
-from trustbo.display import compiling
+from trustbo.display import compiling, say
 from trustbo.errors import (
     TrustboError,
     require_bounds,
@@ -180,7 +180,7 @@ class Campaign(Result):
         learner.require_poolable(state.earlier.missions, workspace)
         super().__init__(workspace, state, learner, base)
 
-        self._progress = progress  # of fits
+        self._progress = progress
         self._has_warned_of_risk = False
         if state.earlier.missions:
             self._learn_from_earlier()
@@ -710,17 +710,25 @@ class Campaign(Result):
 
     @classmethod
     def load(
-        cls, directory: FilePath, *, model: Model | None = None, policy: Policy | None = None
+        cls,
+        directory: FilePath,
+        *,
+        model: Model | None = None,
+        policy: Policy | None = None,
+        progress: bool = True,
     ) -> Self:
         """Load a campaign from its folder, lock the folder, and continue where it stopped.
 
-        A mission that was written to disk but not yet used for learning is used now.
+        A mission that was written to disk but not yet used for learning is used now, which takes as
+        long as `tell`.
 
         Args:
             directory: Folder that was passed as `directory`, or to `Result.save`.
             model: Model of the campaign; required if the model or its priors are custom, or if it
                 is a NumPyro function.
             policy: Policy of the campaign; required if it is a custom function.
+            progress: Whether to say that missions are used now, and to show progress bars; also for
+                later calls.
 
         Raises:
             TrustboError: The folder contains no campaign or is locked by another process, a custom
@@ -747,7 +755,11 @@ class Campaign(Result):
             if name != given["policy"]:
                 raise TrustboError(f"policy {name!r} is not the campaign's, {given['policy']!r}.")
             campaign.state = state
+            campaign._progress = progress
             campaign._use(FolderStorage(lock, files))
+            if progress and pending:
+                n = len(state.entries) + len(pending)
+                say(f"fitting mission {n}, which was recorded but not used for learning")
             if state.due is not None:
                 campaign._finish("an exclusion is recorded")
 

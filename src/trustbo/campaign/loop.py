@@ -94,7 +94,7 @@ def resume(
         TrustboError: The folder contains no campaign or is locked by another process, the model,
             policy or simulator differs from the original, or a file is missing or damaged.
     """
-    with Campaign.load(directory, model=model, policy=policy) as campaign:
+    with Campaign.load(directory, model=model, policy=policy, progress=progress) as campaign:
         state = campaign.state
         before = state.simulation
         if state.entries and not before and simulator is None:

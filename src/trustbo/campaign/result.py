@@ -73,6 +73,7 @@ class Result(Summary):
         self.learner = learner
         self._base = base
         self._turn = threading.RLock()
+        self._progress = True  # whether slow work shows a progress bar
         self._computed: dict[str, Any] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -151,7 +152,8 @@ class Result(Summary):
             )
 
         indices = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
-        whole = self.learner.add_latent(stored, fitted_missions(self.state, indices))
+        used = fitted_missions(self.state, indices)
+        whole = self.learner.add_latent(stored, used, progress=self._progress)
 
         for group in whole.children.values():
             if "mission" in group.dims:
@@ -402,7 +404,9 @@ class Result(Summary):
             FolderStorage.begin(directory, self.workspace, state, overwrite=overwrite).close()
 
 
-def load_result(directory: FilePath, *, model: Model | None = None) -> Result:
+def load_result(
+    directory: FilePath, *, model: Model | None = None, progress: bool = True
+) -> Result:
     """Read the result of a campaign from its folder, without locking the folder.
 
     The campaign may still be running in another process.
@@ -411,6 +415,7 @@ def load_result(directory: FilePath, *, model: Model | None = None) -> Result:
         directory: Folder of a campaign, or a folder written by `Result.save`.
         model: Model of the campaign; needed if it is a NumPyro function, or custom and nothing has
             been learned.
+        progress: Whether to show a progress bar if `posterior` takes longer than 5 seconds.
 
     Raises:
         TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is
@@ -435,7 +440,9 @@ def load_result(directory: FilePath, *, model: Model | None = None) -> Result:
             learner = ClassLearner(None)
         base = to_planner(given, workspace)
 
-    return Result(workspace, state, learner, base)
+    result = Result(workspace, state, learner, base)
+    result._progress = progress
+    return result
 
 
 def in_a_line(row: dict[str, Any]) -> str:

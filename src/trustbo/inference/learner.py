@@ -98,7 +98,9 @@ class Learner(Protocol):
         """Raise TrustboError if the model cannot be fitted to missions of earlier campaigns."""
         ...
 
-    def add_latent(self, posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
+    def add_latent(
+        self, posterior: xr.DataTree, missions: Sequence[Mission], *, progress: bool = True
+    ) -> xr.DataTree:
         """Add latent trust, log-likelihoods and predictions to a posterior."""
         ...
 
@@ -189,10 +191,12 @@ class ClassLearner:
         """See `Learner.require_poolable`."""
         require_poolable_with_model(self._known, earlier, workspace.team.names)
 
-    def add_latent(self, posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
+    def add_latent(
+        self, posterior: xr.DataTree, missions: Sequence[Mission], *, progress: bool = True
+    ) -> xr.DataTree:
         """See `Learner.add_latent`."""
         # The group `log_prior` requires the model if its priors are not the defaults.
-        return add_latent(posterior, missions, model=self.model)
+        return add_latent(posterior, missions, model=self.model, progress=progress)
 
     def draws(
         self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False
@@ -276,9 +280,11 @@ class FunctionLearner:
         """See `Learner.require_poolable`."""
         require_poolable_with_function(self.model, earlier, workspace.team.names)
 
-    def add_latent(self, posterior: xr.DataTree, missions: Sequence[Mission]) -> xr.DataTree:
+    def add_latent(
+        self, posterior: xr.DataTree, missions: Sequence[Mission], *, progress: bool = True
+    ) -> xr.DataTree:
         """See `Learner.add_latent`."""
-        return add_latent(posterior, missions, model=self.model.function)
+        return add_latent(posterior, missions, model=self.model.function, progress=progress)
 
     def draws(
         self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False

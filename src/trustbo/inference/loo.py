@@ -146,8 +146,10 @@ def estimated(target: LeftOut, *, progress: bool = True) -> ELPDData:
             if n_measured < _FEWEST or not k_hat[i] <= limit:
                 if target.refit is None:
                     raise TrustboError(_no_refit(j, k_hat[i], limit, n_measured))
+                bar.set_description_str(f"loo, refit without mission {j}")
                 density[i], k_hat[i] = target.refit(j)
                 refitted[i] = True
+                bar.set_description_str("loo")
             bar.update()
 
     is_bad = ~(k_hat <= limit)
