@@ -468,7 +468,8 @@ class Campaign(Result):
             remedy += ' or planner={"failure_cost": ...}'
         warn(
             f"the plan arrives with probability {plan.p_arrive:.2f} only, which does not influence "
-            f"the choice of paths yet; pass {remedy}, or lower the max_slope of the robots."
+            f"the choice of paths yet; pass {remedy}, or lower the max_slope of the robots. The "
+            "page Failures of the documentation explains this probability."
         )
 
     def tell(self, mission: Mission, *, again: bool = False) -> xr.DataTree | None:

@@ -348,7 +348,14 @@ def sample_prior(
         seed: Random seed; the same seed gives the same draws.
         n_robots: Number of robots, for models with separate parameters for each robot.
     """
-    require_kind("model", model, TrustModel, "give a model such as PooledTrust()")
+    remedy = "give a model such as PooledTrust()"
+    if callable(model) and not isinstance(model, type | TrustModel):
+        remedy = (
+            "draw from a NumPyro function with numpyro.infer.Predictive(model, "
+            "num_samples=500)(jax.random.key(0), awareness), where awareness has the shape "
+            "(mission, bound, robot, feature)"
+        )
+    require_kind("model", model, TrustModel, remedy)
     n_draws = require_count("n_draws", n_draws)
     seed = require_whole("seed", seed, 0)
 
