@@ -74,6 +74,21 @@ def test_campaign_that_dies_at_any_write_resumes_identically(
         same(tb.load_result(folder), whole)
 
 
+def test_loading_says_that_it_learns_from_a_mission(workspace, tmp_path, capsys):
+    field = tmp_path / "field"
+    with tb.Campaign(workspace, *ENDS, directory=field, **OPTIONS) as campaign:
+        path = campaign.ask().path
+        record = (field / "campaign.json").read_bytes()
+        campaign.tell(ModelSimulator(workspace).run(path, seed=0))
+    (field / "campaign.json").write_bytes(record)  # as if the process had died while it learned
+
+    for progress in (True, False):
+        copy = shutil.copytree(field, tmp_path / str(progress))
+        with tb.Campaign.load(copy, progress=progress) as again:
+            assert again.table()["state"].tolist() == ["learned"]
+        assert ("fitting mission 1" in capsys.readouterr().err) == progress
+
+
 @pytest.fixture(scope="module")
 def folder(workspace, tmp_path_factory):
     """Folder of a campaign that was driven; tests copy it."""

@@ -19,14 +19,18 @@ from scipy import stats
 import trustbo as tb
 from trustbo.errors import PosteriorError
 from trustbo.inference import params_of
+from trustbo.inference.functions.data import data_of
+from trustbo.inference.functions.fit import _judge as judge
 from trustbo.inference.functions.function import (
     as_model,
     constants_of,
     fingerprint,
     model_of_record,
 )
+from trustbo.inference.functions.nuts import Samples
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.backend import own_settings
+from trustbo.models.observations import Observations
 
 FEATURES = ("traversability", "line_of_sight")
 
@@ -495,9 +499,44 @@ def test_variables_that_are_not_identified_are_named_if_the_drift_is(missions):
         rates = ContactRate(jnp.abs(a) + 0.0 * awareness[..., 0], 0.1, 0.02, 0.02)
         numpyro.sample("contact_rate", rates, obs=contact_rate)
 
-    with pytest.warns(UserWarning, match="the chains of a differ"):
+    with pytest.warns(UserWarning, match="the chains of a differ") as said:
         posterior = tb.fit(missions, model, latent=False, seed=1, progress=False)
+    assert {one.filename for one in said} == {__file__}  # the line of the caller
     assert posterior.attrs["not_identified"] == ["a"]
+
+
+def test_a_noise_is_not_called_unidentified_where_the_noises_are_accepted(missions):
+    """Few effective draws of delta_v are enough in the last run, for itself as for the noises."""
+
+    def model(awareness, contact_rate=None):
+        numpyro.sample("unused", dist.Normal())
+        delta_v = numpyro.sample("delta_v", dist.HalfNormal(0.1))
+        delta_w = numpyro.sample("delta_w", dist.HalfNormal(0.1))
+        rates = ContactRate(0.3 * awareness[..., 0], 0.4, delta_w, delta_v)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    n_draws = 500
+    rng = np.random.default_rng(0)
+    step = rng.normal(size=(3, 4, n_draws))
+    slow = np.empty(step.shape)
+    slow[..., 0] = step[..., 0]
+    for k in range(1, n_draws):  # about 100 effective draws
+        slow[..., k] = 0.9 * slow[..., k - 1] + np.sqrt(1.0 - 0.9**2) * step[..., k]
+    apart = slow[2] + 5.0 * np.arange(4)[:, None]  # chains that do not mix
+    z = {"delta_v": slow[0] - 3.0, "delta_w": slow[1] - 3.0, "unused": apart}
+    samples = Samples(z, {"diverging": np.zeros((4, n_draws), bool)}, 0.1)
+
+    data = data_of(missions, Observations.from_missions(missions))
+    strict = judge(as_model(model), data, samples, patient=True)
+    rough = judge(as_model(model), data, samples, patient=True, last=True)
+    assert any("ESS" in complaint for complaint in strict.complaints)
+    assert rough.complaints == []
+    assert rough.not_identified == ["unused"]
+
+
+def test_the_prior_of_a_function_is_drawn_by_numpyro():
+    with pytest.raises(tb.TrustboError, match="Predictive"):
+        tb.inference.sample_prior(linear, 2, 10, 0)
 
 
 def test_other_samplers_are_refused(missions):
