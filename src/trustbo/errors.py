@@ -10,8 +10,11 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-_NOT_CALLERS = str(Path(__file__).parent), contextlib.__file__
-"""Code that no warning points at: the package, and the decorators of its functions."""
+_NOT_CALLERS = str(Path(__file__).parent), contextlib.__file__.removesuffix(".py")
+"""Code that no warning points at: the package, and the decorators of its functions.
+
+Python does not skip a file if the prefix is its whole name.
+"""
 
 
 class TrustboError(ValueError):

@@ -323,7 +323,8 @@ def test_bad_input_is_refused_before_anything_is_written(workspace, tmp_path, op
     assert not (tmp_path / "never").exists()
 
 
-def test_progress_is_a_line(workspace, capsys):
+def test_progress_is_a_line(workspace, capsys, monkeypatch):
+    monkeypatch.setattr("trustbo.display.shows_bars", lambda: True)  # as in a terminal
     run(workspace, n_iterations=1)
     assert capsys.readouterr() == ("", "")
     run(workspace, n_iterations=1, progress=True)
