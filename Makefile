@@ -1,11 +1,12 @@
 # make demo       install into .venv and run a campaign on a real hillside, whose map is old
 # make test       install what the tests need too, and run them
+# make jupyter    install JupyterLab and open the notebooks
 # make notebooks  run the notebooks, with fewer missions than they show
 # make slow       run the tests that take long, which make test leaves out
 # make lint       format, style, types and the direction of imports
 # make docs       build the documentation site, and say where to open it
 # make bench      install the peers, and print the figures we claim beside theirs
-# make peers      ask pip whether the peers can be installed, and install nothing
+# make peers      ask pip whether the peers and JupyterLab can be installed, and install nothing
 # make clean      remove what make made, but not the campaigns in out/
 
 VENV := .venv
@@ -16,7 +17,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 # Where a container's shell says so, Python would compile all modules anew at each start, 7 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test notebooks slow lint docs bench peers clean
+.PHONY: demo test jupyter notebooks slow lint docs bench peers clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python scripts/demo.py --out out/demo
@@ -24,6 +25,9 @@ demo: $(VENV)/.installed
 # A fresh clone compiles for long what these tests run for short: with no optimisation, half as long.
 test: $(VENV)/.installed-dev
 	XLA_FLAGS=--xla_backend_optimization_level=0 $(PYTEST) -m "not slow" tests
+
+jupyter: $(VENV)/.installed-notebook
+	$(BIN)/jupyter lab notebooks
 
 notebooks: $(VENV)/.installed-dev
 	TRUSTBO_FAST=1 $(PYTEST) --nbmake notebooks
@@ -45,7 +49,7 @@ bench: $(VENV)/.installed-bench
 	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
 
 peers: $(VENV)/.installed
-	$(PIP) --dry-run --editable ".[bench]"
+	$(PIP) --dry-run --editable ".[bench,notebook]"
 
 clean:
 	rm -rf $(VENV) .cache out/docs build dist .pytest_cache .ruff_cache .import_linter_cache
@@ -68,6 +72,10 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	$(PIP) --editable ".[docs]"
+	@touch $@
+
+$(VENV)/.installed-notebook: $(VENV)/.installed
+	$(PIP) --editable ".[notebook]"
 	@touch $@
 
 # The samplers we compare ourselves with.

@@ -1,10 +1,13 @@
 """Paired comparisons of methods by group and kind of world, and comparison with version 0.3.
 
+    python benchmarks/groups.py [FILE]   # by default, the stored table of version 0.4
+
 The results are from benchmarks/worlds.py. A row (see `rows_of`) is the mean over seeds of one
 method on one world and course. `lost` is the contact lost while learning, in bounds per mission;
 bounds that fail or are not reached count as fully lost.
 """
 
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -19,14 +22,18 @@ from trustbo.study.summary import bootstrap
 OURS, BASELINES = "trustbo", ("running mean", "residual process", "line of sight")
 KINDS = ("right", "wall", "bare", "slopes", "aged", "canopy", "shapes", "teams",
          "robots", "days", "foul", "change", "jammer", "physics", "limit")  # fmt: skip
-CALM = KINDS[:8]
-"""Kinds in which robots and missions are alike; only the survey or the sight may be wrong."""
-WRONG = KINDS[8:]
+ALIKE = {
+    "map right": ("right", "slopes", "shapes", "teams"),
+    "map wrong": ("wall", "bare", "aged", "canopy"),
+    "robots, weather, changes": ("robots", "days", "foul", "change"),
+    "jammers and radio": ("jammer", "physics"),
+    "wrong slope limit": ("limit",),
+}
+"""Kinds of worlds by what differs from the assumptions; each kind is in one group."""
 GROUPS = {
+    **ALIKE,
+    "all but wrong slope limits": KINDS[:-1],
     "all": KINDS,
-    "calm": CALM,
-    "goes wrong": WRONG,
-    "goes wrong, without jammer and physics": tuple(set(WRONG) - {"jammer", "physics"}),
 }
 """Kinds of worlds in each group, keyed by the name of the group."""
 LOST = "lost_with_failures"
@@ -237,3 +244,8 @@ def interval(row: object, places: int) -> str:
         for name in ("value", "low", "high")
     )
     return f"{value:z.{places}f} [{low:z.{places}f}, {high:z.{places}f}]"
+
+
+if __name__ == "__main__":
+    stored = Path(__file__).parent / "reference" / "worlds_0.4.csv"
+    report_groups(pd.read_csv(sys.argv[1] if len(sys.argv) > 1 else stored))

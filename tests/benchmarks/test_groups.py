@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from groups import (
+    ALIKE,
     GROUPS,
     KINDS,
     LOST,
@@ -49,9 +50,8 @@ def of_row(table, **labels):
 
 def test_every_kind_of_world_is_in_one_of_the_groups():
     assert set(KINDS) == {world.kind for world in worlds().values()}
-    assert set(GROUPS["calm"]) | set(GROUPS["goes wrong"]) == set(KINDS)
-    assert not set(GROUPS["calm"]) & set(GROUPS["goes wrong"])
-    assert "limit" in GROUPS["goes wrong, without jammer and physics"]
+    assert sorted(kind for kinds in ALIKE.values() for kind in kinds) == sorted(KINDS)
+    assert set(GROUPS["all but wrong slope limits"]) == set(KINDS) - {"limit"}
 
 
 def test_groups_have_the_means_of_their_worlds_and_the_best_baseline():
@@ -179,7 +179,7 @@ def test_version_0_3_is_compared_on_the_worlds_that_both_have():
 def test_the_report_has_every_group_and_kind(capsys):
     report_groups(made(lambda method, world, course: LOSES[method]))
     text = capsys.readouterr().out
-    assert "| goes wrong, without jammer and physics (" in text
+    assert "| robots, weather, changes (" in text
     assert text.count("| limit, ") == 2
     assert all(f"| {kind} (" in text for kind in KINDS)
 
