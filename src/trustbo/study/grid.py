@@ -86,7 +86,7 @@ def run_grid(
         TrustboError: If a run failed; call the function again to repeat failed runs.
 
     Example:
-        >>> cases = {"greedy": {}, "thompson": {"policy": "thompson"}}
+        >>> cases = {"default": {}, "thompson": {"policy": "thompson"}}
         >>> table = tb.study.run_grid(cases, {"hills": make_scene}, "out", seeds=range(3))
     """
     require_count("n_missions", n_missions)
