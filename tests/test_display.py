@@ -6,13 +6,23 @@ from functools import cache
 from xml.etree import ElementTree
 
 import numpy as np
+import numpyro.distributions as dist
 import pytest
 from numba import njit
 
 import trustbo as tb
 from trustbo import display
 from trustbo.display import Summary, compiling
-from trustbo.models import PooledTrust, Priors, TrustParams
+from trustbo.hazard.risk import Risk
+from trustbo.models import (
+    CoupledTrust,
+    HierarchicalTrust,
+    HumanTrust,
+    PooledTrust,
+    Priors,
+    TrustParams,
+    default_model,
+)
 
 
 class Odd(Summary):
@@ -35,8 +45,11 @@ def test_an_object_in_a_notebook_is_a_table_of_its_rows():
     ]
 
 
-def test_lines_are_cut_at_the_width_of_a_terminal():
-    assert max(map(len, repr(Odd()).splitlines())) == 100
+def test_lines_are_wrapped_at_the_width_of_a_terminal_and_long_texts_are_cut():
+    lines = repr(Odd()).splitlines()
+    assert max(map(len, lines)) == 100
+    assert len(lines) == 5
+    assert lines[-1].endswith("...")
 
 
 def test_every_object_is_displayed():
@@ -48,10 +61,38 @@ def test_every_object_is_displayed():
     objects = [
         workspace, workspace.grid, workspace.team, mission,
         planner, planner.plan(params), params, Priors(), PooledTrust(), simulator,
+        default_model(), CoupledTrust(Priors.for_cells()), HierarchicalTrust(), HumanTrust(),
+        Risk(np.full((8, 3, 3), 0.1)),
     ]  # fmt: skip
     for one in objects:
         assert 1 < len(repr(one).splitlines()) < 20
         ElementTree.fromstring(f"<div>{one._repr_html_()}</div>")
+
+
+def test_a_campaign_and_what_it_makes_are_displayed_in_a_few_lines():
+    workspace = tb.Workspace.from_awareness(np.full((2, 3, 3, 1), 0.5))
+    campaign = tb.Campaign(workspace, (2, 0), (0, 2))
+    follower = tb.Follower(campaign)
+    for one in (campaign, campaign.risk, follower, follower.ahead()):
+        text = repr(one)
+        assert 1 < len(text.splitlines()) < 20
+        assert " at 0x" not in text
+        assert max(map(len, text.splitlines())) <= 100
+
+    follower.begin(0.0)
+    follower.tick(1.0, [1, 0])
+    follower.end(2.0)
+    (bound,) = follower.bounds
+    assert "contact_rate=[1.000, 0.000]" in repr(bound)
+    assert len(repr(bound).splitlines()) == 1
+
+
+def test_a_model_shows_its_effects_and_the_priors_that_it_uses():
+    text = repr(default_model(priors=Priors(tau=dist.HalfNormal(0.7), beta0=dist.Beta(3.0, 5.0))))
+    assert "PlaceEffect(tau_s=" in text
+    assert "Beta(concentration1=3" in text
+    assert "0.7" not in text
+    assert "0.7" in repr(HierarchicalTrust(Priors(tau=dist.HalfNormal(0.7))))
 
 
 def test_compiling_is_announced_once(capsys, monkeypatch):

@@ -104,6 +104,14 @@ def test_links_and_figures_of_a_page_exist(page):
             assert section in anchors_of(linked.read_text()), f"{target} has no such heading"
 
 
+def test_pages_to_which_messages_refer_exist():
+    sources = [file.read_text() for file in (ROOT / "src").rglob("*.py")]
+    pages = [page for text in sources for page in re.findall(r"\bsee\([\"']([^\"']+)", text)]
+    assert pages
+    for page in pages:
+        assert (ROOT / "docs" / f"{page}.md").exists(), f"docs/{page}.md is not there"
+
+
 def anchors_of(text):
     """What `#...` may say: the headings as GitHub and MyST write them, and named targets."""
     headings = re.findall(r"^#+ (.+)$", text, flags=re.M)

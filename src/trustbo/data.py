@@ -28,7 +28,7 @@ LINE_OF_SIGHT = "line_of_sight"
 """Feature name of the predicted contact rate; `line_of_sight_1`, `_2`, ... if several."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Bound:
     """Measurements of one bound, one row per overwatching robot.
 
@@ -95,6 +95,13 @@ class Bound:
             raise TrustboError(f"duration[{i}] = {self.duration[i]:g} s must be positive.")
 
         require_shares(self.contact_rate, self.n_ticks)
+
+    def __repr__(self) -> str:
+        rates = ", ".join(f"{rate:.3f}" for rate in self.contact_rate)
+        seconds = np.nanmax(self.duration, initial=0.0)
+        duration = f", duration={seconds:.4g} s" if seconds else ""
+        place = "no map" if self.cell == NOWHERE else f"cell={self.cell}"
+        return f"Bound({place}, status={self.status!r}, contact_rate=[{rates}]{duration})"
 
     @property
     def t1(self) -> float:

@@ -1,6 +1,7 @@
 """Display of objects and progress, as text in a terminal and as HTML in a notebook."""
 
 import sys
+import textwrap
 import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -14,6 +15,7 @@ with warnings.catch_warnings():  # tqdm warns if ipywidgets is missing
 Rows = list[tuple[str, str]]
 """Names and values, with units, of the main properties of an object."""
 _WIDTH = 100
+_MAX_LINES = 3  # of a property
 _PATIENCE = 5.0  # seconds of work before a progress bar appears
 
 
@@ -29,8 +31,18 @@ class Summary:
     def __repr__(self) -> str:
         rows = self._rows()
         wide = max((len(name) for name, _ in rows), default=0)
-        lines = [type(self).__name__, *(f"  {name:<{wide}}  {value}" for name, value in rows)]
-        return "\n".join(line if len(line) <= _WIDTH else f"{line[:97]}..." for line in lines)
+        lines = [type(self).__name__]
+        for name, value in rows:
+            lines += textwrap.wrap(
+                " ".join(value.split()),
+                _WIDTH,
+                initial_indent=f"  {name:<{wide}}  ",
+                subsequent_indent=" " * (wide + 4),
+                max_lines=_MAX_LINES,
+                break_on_hyphens=False,
+                placeholder="...",
+            ) or [f"  {name}"]
+        return "\n".join(lines)
 
     def _repr_html_(self) -> str:
         return render("summary.html", name=type(self).__name__, rows=self._rows())

@@ -137,6 +137,11 @@ def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
     return value
 
 
+def see(page: str) -> str:
+    """Refer to a page of the documentation, by its path in `docs/` without the ending."""
+    return f"see docs/{page}.md"
+
+
 def one_line(value: object) -> str:
     """Format a value for a one-line message: the first 60 characters of its repr."""
     words = " ".join(repr(value).split())

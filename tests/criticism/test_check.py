@@ -102,3 +102,21 @@ def test_what_is_no_posterior_of_contact_is_refused():
     for nothing in ({}, []):
         with pytest.raises(tb.TrustboError):
             tb.check(nothing)
+
+
+def test_posteriors_of_a_campaign_read_from_files_are_checked(tmp_path):
+    terrain = tb.terrain.synthetic_terrain((40.0, 30.0), 2.0, seed=0, relief=3.0)
+    workspace = tb.Workspace.from_terrain(terrain, (4, 3))
+    tb.iterate(
+        workspace, (3, 0), (0, 2), n_iterations=3, seed=1, progress=False, directory=tmp_path / "c"
+    )
+
+    result = tb.load_result(tmp_path / "c")
+    given = tb.check(list(result.posteriors), missions=result.missions)
+    found = tb.check(result.posteriors)
+    assert found.table.equals(given.table)
+    assert "%" in found.table.loc["coverage", "finding"]
+
+    one = tb.inference.score(result.posteriors)
+    other = tb.inference.score(list(result.posteriors), result.missions)
+    assert one.equals(other)

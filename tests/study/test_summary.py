@@ -80,6 +80,12 @@ def test_intervals_are_those_of_a_bootstrap_over_clusters():
     assert (high - low) / (2 * 1.96) == pytest.approx(sd / np.sqrt(12), rel=0.25)
 
 
+def test_a_table_of_scenes_without_truth_is_refused():
+    table = table_by_hand().drop(columns=["regret", "lost", "best"])
+    with pytest.raises(TrustboError, match="truth"):
+        numbers_of(table)
+
+
 def test_unknown_cases_and_columns_are_refused():
     numbers = numbers_of(table_by_hand())
     with pytest.raises(TrustboError):

@@ -9,14 +9,15 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.replan import trust_filter
-from trustbo.data import Bound, Cell, Mission
+from trustbo.data import Bound, Cell, Mission, path_text
+from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_finite, require_kind, require_pair
 from trustbo.inference.filter import TrustForecast, TrustState
 from trustbo.planning import Plan
 from trustbo.workspace.grid import Location
 
 
-class Follower:
+class Follower(Summary):
     """Follows a mission of a campaign bound by bound and tick by tick.
 
     Call `begin`, `tick` and `end` for each bound, and `replan` to plan the rest of the mission
@@ -55,6 +56,19 @@ class Follower:
         self._started = self._begun = self._last = -np.inf  # times of start and last call
         n_robots = self._workspace.team.n_robots
         self._counts = np.zeros((2, n_robots))  # ticks with contact; all ticks
+
+    def _rows(self) -> Rows:
+        here, *planned = self.rest
+        doing = f"entering {path_text([here])}" if self.running else f"in {path_text([here])}"
+        if self._is_over:
+            doing = f"over after {path_text([here])}: {self.bounds[-1].status}"
+        trust = zip(self._workspace.team.names, self.trust.mean, self.trust.sd, strict=True)
+        return [
+            ("path", path_text(self.path)),
+            ("bounds", f"{len(self.bounds)} ended, {len(planned)} planned"),
+            ("lead", doing),
+            ("trust", ", ".join(f"{name} {mean:.2f} ± {sd:.2f}" for name, mean, sd in trust)),
+        ]
 
     @property
     def rest(self) -> tuple[Cell, ...]:

@@ -28,6 +28,7 @@ from trustbo.files import FilePath, interpreting, to_path
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference.functions.function import is_of_function
 from trustbo.inference.learner import ClassLearner, Learner, Model, learner_from_record
+from trustbo.inference.score import Posteriors
 from trustbo.models.backend import VERSIONS
 from trustbo.models.draws import Draws
 from trustbo.planning import InfeasibleError, Plan, Planner
@@ -129,9 +130,10 @@ class Result(Summary):
         return [entry.mission for entry in self.state.entries]
 
     @property
-    def posteriors(self) -> list[xr.DataTree | None]:
-        """Posterior of the parameters after each mission; None where there was none yet."""
-        return [entry.posterior and entry.posterior() for entry in self.state.entries]
+    def posteriors(self) -> Posteriors:
+        """List of the parameter posteriors after each mission; None where there was none yet."""
+        trees = [entry.posterior and entry.posterior() for entry in self.state.entries]
+        return Posteriors(trees, self.missions)
 
     @computed
     def posterior(self) -> xr.DataTree:

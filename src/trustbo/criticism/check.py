@@ -19,7 +19,7 @@ from trustbo.inference.draws import (
     theta_of,
 )
 from trustbo.inference.place_maps import of_workspace
-from trustbo.inference.score import last_posterior, predictions, score
+from trustbo.inference.score import Posteriors, last_posterior, predictions, score
 from trustbo.models.families import FAMILIES
 from trustbo.parallel import computing
 
@@ -86,14 +86,15 @@ def check(
     Args:
         posterior: Posterior from `fit`, or all posteriors of a campaign (`Result.posteriors`). For
             a campaign, the last posterior is checked, and the predictions of the others are scored.
-        missions: All missions of the campaign; by default, the missions in the last posterior.
-            Missions without an earlier posterior and excluded missions are not predicted.
+        missions: All missions of the campaign; by default, those of `Result.posteriors`, or the
+            missions in the last posterior. Missions without an earlier posterior and excluded
+            missions are not predicted.
 
     Raises:
         TrustboError: If the posterior is not from `fit`, was fitted to people's reports, or
             contains no data although `missions` is None.
     """
-    trees = list(posterior) if isinstance(posterior, Sequence) else [posterior]
+    trees = posterior if isinstance(posterior, Sequence) else [posterior]
     tree = last_posterior("check", trees)
     if is_of_people(tree):
         raise TrustboError(
@@ -234,7 +235,8 @@ def _check_coverage(
     if len(trees) < 2:
         return Finding("not tested: this check needs all posteriors of a campaign")
 
-    missions = missions_of(last) if missions is None else missions
+    if missions is None:
+        missions = trees.missions if isinstance(trees, Posteriors) else missions_of(last)
     if not predictions("check", trees, missions)[0]:
         return Finding("not tested: no mission has an earlier posterior that predicts it")
 

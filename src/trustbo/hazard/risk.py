@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell
+from trustbo.display import Rows, Summary
 from trustbo.errors import OldName, Renamed, TrustboError, require_whole
 from trustbo.hazard.components import Components, partition
 from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, TILT, prior_betas, steepness_of
@@ -26,7 +27,7 @@ _SOME = 256
 """Approximate number of bounds whose mean probability orders the draws."""
 
 
-class BoundRisk:
+class BoundRisk(Summary):
     """Posterior of the probability that each bound of a workspace ends the mission.
 
     Maps have shape (move, row, col), where (row, col) is the cell that a bound enters and moves are
@@ -69,6 +70,20 @@ class BoundRisk:
 
         self._lost = [path[path[:, 0] >= 0] for path in hazard["lost_bound"].values]
         self._place = hazard["place"].values  # (draw, lost), from 1
+
+    def _rows(self) -> Rows:
+        n_driven = int((self.trials[self.exists] > 0).sum())
+        n_unknown = len(self._lost)
+        failures = f"{int(self.failures.sum())} at a known bound"
+        if n_unknown:
+            failures += f", {n_unknown} in an unknown bound of a path"
+
+        return [
+            ("bounds", f"{int(self.exists.sum())}, of which {n_driven} were driven"),
+            ("trials", f"{int(self.trials.sum())}"),
+            ("failures", failures),
+            *_rows_of_failures(self.mean),
+        ]
 
     @cached_property
     def mean(self) -> np.ndarray:
@@ -170,6 +185,15 @@ class BoundRisk:
         return a, b
 
 
+def _rows_of_failures(p_fail: np.ndarray) -> Rows:
+    """Summarise failure probabilities (move, row, col)."""
+    p = p_fail[np.isfinite(p_fail)]
+    if not p.size:
+        return [("failure probability", "no bound can be driven")]
+    middle, high = np.quantile(p, (0.5, 0.95))
+    return [("failure probability", f"median {middle:.3g}, 95 % quantile {high:.3g} over bounds")]
+
+
 def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
     """Update a and b (point, bound) with a mission that failed at index `place` (point,) of `path`.
 
@@ -182,8 +206,8 @@ def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) 
 
 
 @Renamed(strata="components")
-@dataclass(frozen=True, eq=False)
-class Risk:
+@dataclass(frozen=True, eq=False, repr=False)
+class Risk(Summary):
     """Probability that each bound of a workspace ends the mission.
 
     Attributes:
@@ -212,6 +236,15 @@ class Risk:
             bad = (p < 0.0) | (p > 1.0)
             if bad.any():
                 raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")
+
+    def _rows(self) -> Rows:
+        n_draws = 0 if self.draws is None else len(self.draws)
+        together = "independent" if self.components is None else "correlated"
+        return [
+            *_rows_of_failures(self.p_fail),
+            ("draws", str(n_draws)),
+            ("failures of bounds", together),
+        ]
 
     def failure(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Compute the failure probability of a path, for `failure_cost` and `max_failure`.

@@ -53,6 +53,18 @@ class TrustForecast(NamedTuple):
     rate_high: np.ndarray
     draws: np.ndarray
 
+    def __repr__(self) -> str:
+        n_bounds, n_robots = self.rate.shape
+        lines = [
+            f"TrustForecast of {n_bounds} bounds, {n_robots} robots, {len(self.draws)} draws",
+            "  contact rate of each robot, mean [5 %, 95 %], by bound ahead",
+        ]
+        ranges = np.stack([self.rate, self.rate_low, self.rate_high], axis=-1)
+        for k, of_robots in enumerate(ranges, start=1):
+            texts = ["{:.2f} [{:.2f}, {:.2f}]".format(*of_robot) for of_robot in of_robots]
+            lines.append(f"  {k:>3}  {'  '.join(texts)}")
+        return "\n".join(lines)
+
 
 class TrustFilter:
     """Rao-Blackwellised filter for the trust of each robot during a mission.

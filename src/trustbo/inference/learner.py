@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Protocol
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import Renamed, TrustboError, require_kind
+from trustbo.errors import Renamed, TrustboError, require_kind, see
 from trustbo.inference.draws import (
     expected_and_drawn_of_model,
     missions_of,
@@ -327,7 +327,8 @@ def learner_of(model: Model | FunctionModel | None, workspace: Workspace) -> Lea
 
     is_function = callable(model) and not isinstance(model, type)
     if not is_function and not isinstance(model, FunctionModel):
-        remedy = "give a trust model, such as PooledTrust(), or a NumPyro function"
+        page = see("howto/your-own-model")
+        remedy = f"give a trust model, such as PooledTrust(), or a NumPyro function ({page})"
         require_kind("model", model, TrustModel, remedy)
     function = as_model(model)
     require_plannable(function, workspace)

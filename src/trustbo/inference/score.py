@@ -1,6 +1,6 @@
 """Scores of contact rates that were predicted before a mission."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import xarray as xr
@@ -21,10 +21,29 @@ INTERVALS = {"coverage_50": 0.5, "coverage_90": 0.9}
 _DIMS = ("mission", "bound", "robot")
 
 
+class Posteriors(list[xr.DataTree | None]):
+    """Posteriors after each mission of a campaign, which know the missions.
+
+    Attributes:
+        missions: All missions of the campaign, in order.
+    """
+
+    def __init__(
+        self, posteriors: Iterable[xr.DataTree | None], missions: Sequence[Mission]
+    ) -> None:
+        """Store the posteriors, None where there was none yet, and the missions."""
+        super().__init__(posteriors)
+        self.missions = list(missions)
+
+    def __repr__(self) -> str:
+        n_learned = sum(tree is not None for tree in self)
+        return f"<{n_learned} posteriors after {len(self)} missions; the last is [-1]>"
+
+
 @computing()
 def score(
     posterior: xr.DataTree | Sequence[xr.DataTree | None],
-    missions: Sequence[Mission],
+    missions: Sequence[Mission] | None = None,
     *,
     workspace: Workspace | None = None,
     seed: int = 0,
@@ -37,8 +56,9 @@ def score(
     Args:
         posterior: Posterior that predicts all `missions` and was fitted to none of them; or all
             posteriors of a campaign (`Result.posteriors`), each of which predicts the next mission.
-        missions: Missions to predict; for a campaign, all missions in order. Missions without an
-            earlier posterior and missions that the campaign excluded are left out.
+        missions: Missions to predict; for a campaign, all missions in order, which
+            `Result.posteriors` contains. Missions without an earlier posterior and missions that
+            the campaign excluded are left out.
         workspace: Workspace of the missions, used to fill in missing awareness as in `fit`.
         seed: Random seed for predictive draws and randomised PIT values.
 
@@ -57,6 +77,8 @@ def score(
             tick counts are missing.
     """
     require_whole("seed", seed, 0)
+    if missions is None and isinstance(posterior, Posteriors):
+        missions = posterior.missions
     missions = require_list("missions", missions, Mission, "give a list of missions")
 
     known = range(len(missions))

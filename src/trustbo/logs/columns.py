@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from trustbo.errors import TrustboError, one_line
+from trustbo.errors import TrustboError, one_line, see
 from trustbo.files import FilePath, read_file
 
 _BLANK = ("", "na", "n/a", "#n/a", "#na", "nan", "nat", "none", "null", "<na>")
@@ -161,7 +161,10 @@ class Columns:
         name = self.find(column)
         if name is None and required:
             there = ", ".join(self.frame) or "no columns"
-            raise TrustboError(f"{self.what} lacks {column}; it has {there}. Choose or rename one.")
+            raise TrustboError(
+                f"{self.what} lacks {column}; it has {there}. Choose or rename one, and "
+                f"{see('howto/your-own-robots')}."
+            )
         return pd.Series(np.nan, self.frame.index) if name is None else self.frame[name]
 
 

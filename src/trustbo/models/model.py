@@ -20,7 +20,7 @@ from trustbo.models.effects.effect import Effect, Theta, sample_coefficients
 from trustbo.models.effects.weights import Weights
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.observations import Observations, require_ticks
-from trustbo.models.priors import Priors
+from trustbo.models.priors import Priors, as_text
 from trustbo.models.scores import NormalScores
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.statespace.blocks import Layout, LinearPredictor
@@ -29,6 +29,13 @@ from trustbo.workspace import Workspace
 
 MODELS: dict[str, type["TrustModel"]] = {}
 """Model classes by name, to read models from files."""
+_PRIOR_OF = {
+    "tau_beta": "tau",
+    "tau_b": "tau",
+    "partial_w": "concentration",
+    "partial_v": "concentration",
+}
+"""Fields of `Priors` whose hyperparameters have other names."""
 _JITTER = 1e-13  # added to the covariance of trust, so that rounding does not make it singular
 
 
@@ -299,7 +306,32 @@ class TrustModel(Summary, ABC):
         return [
             ("rates", self.family),
             *((n, str(v)) for n, v in self.options().items() if n != "family"),
-            *(("effects", f"of {effect.group}") for effect in self.effects),
+            *((f"effect of {effect.group}", str(effect)) for effect in self.effects),
+            *self._rows_of_priors(),
+        ]
+
+    def _rows_of_priors(self) -> Rows:
+        """Return the priors that the model uses; those of its effects are in the effects."""
+        hyperpriors = self.hyperpriors(2, 1)
+        used = {"beta", "b", "x0_mean", "x0_sd", *hyperpriors}
+        used |= {_PRIOR_OF[name] for name in hyperpriors if name in _PRIOR_OF}
+        texts = self.priors.describe()
+        own = [name for name in hyperpriors if name not in texts and name not in _PRIOR_OF]
+
+        rows = []
+        if self.priors is Priors.default(self.family):
+            used -= {"beta", "b"}
+            rows.append(("prior of beta, b", "by the features, see Priors.from_features"))
+
+        for name, text in texts.items():
+            if name in used:
+                of_limit = self.priors.stationary and name in ("beta", "b")
+                rows.append((f"prior of {name}{' / (1 - beta0)' * of_limit}", text))
+
+        options = self.options()  # show their own priors, if any
+        return [
+            *rows,
+            *((f"prior of {n}", as_text(hyperpriors[n])) for n in own if n not in options),
         ]
 
     def in_short(self) -> str:

@@ -18,6 +18,7 @@ from trustbo.errors import (
     require_finite,
     require_list,
     require_positive,
+    see,
 )
 from trustbo.models.backend import own_settings
 from trustbo.models.families import FAMILIES
@@ -192,7 +193,7 @@ class Priors(Summary):
 
     def describe(self) -> dict[str, str]:
         """Describe each prior as text, for the record of a posterior."""
-        return {one.name: _as_text(getattr(self, one.name)) for one in fields(self)}
+        return {one.name: as_text(getattr(self, one.name)) for one in fields(self)}
 
 
 def _wanted(name: str, prior: Any) -> str:
@@ -204,7 +205,7 @@ def _wanted(name: str, prior: Any) -> str:
         good = isinstance(prior, dist.Normal)
         wanted = (
             f"Normal, because the model integrates {name} out (for other priors, write a NumPyro "
-            "model with models.ContactRate)"
+            f"model; {see('howto/your-own-model')})"
         )
     elif name == "beta0":
         good = prior.support is constraints.unit_interval
@@ -216,7 +217,7 @@ def _wanted(name: str, prior: Any) -> str:
     return "" if good else wanted
 
 
-def _as_text(prior: Distribution | float) -> str:
+def as_text(prior: Distribution | float) -> str:
     """Format a distribution or a number as text."""
     if isinstance(prior, bool):
         return "yes" if prior else "no"

@@ -38,7 +38,7 @@ text.text = texts[n - 1]
 """JavaScript callback that runs when the user selects a layer or a mission."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Explorer:
     """Interactive HTML page, which notebooks display.
 
@@ -51,6 +51,10 @@ class Explorer:
     def save(self, path: FilePath) -> None:
         """Write the page to an HTML file."""
         write_text(path, self.html)
+
+    def __repr__(self) -> str:
+        size = len(self.html) / 1e6
+        return f"Explorer: interactive page, {size:.1f} MB; save(path) writes it, notebooks show it"
 
     def _repr_html_(self) -> str:
         page = escape(self.html, quote=True)

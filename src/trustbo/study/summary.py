@@ -44,8 +44,17 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     number of missions plus one if it never does. `arrive` is the fraction of missions that reach
     the goal, `arrive of the first 3` and `arrive later` the same for the first three and the other
     missions. `seconds` is the CPU time per mission.
+
+    Raises:
+        TrustboError: If no scene has a truth.
     """
     require_kind("table", table, pd.DataFrame, "give the table of run_grid")
+    if "regret" not in table:
+        raise TrustboError(
+            "numbers_of needs the regret of paths, but the scenes have no truth. Give "
+            "Scene(..., truth=Truth.from_simulator(simulator)) and call run_grid in another folder."
+        )
+
     labels = [name for name in table.columns if name not in _JUDGED]
     rows = [_numbers(run) for _, run in table.groupby(_RUN, sort=False)]
     of_runs = table.groupby(_RUN, sort=False)[labels].first()

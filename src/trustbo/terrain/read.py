@@ -21,7 +21,7 @@ from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.io import DatasetReader
 from rioxarray.exceptions import MissingSpatialDimensionError
 
-from trustbo.errors import TrustboError, require_kind, require_positive, warn
+from trustbo.errors import TrustboError, require_kind, require_positive, see, warn
 from trustbo.files import FilePath
 from trustbo.terrain.heights import ACCESSOR_FILL, in_metres
 from trustbo.terrain.pixels import pixel_size
@@ -148,7 +148,8 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
     if crs is None:
         raise TrustboError(
             "the terrain has no coordinate reference system; open its file with "
-            'decode_coords="all", or set it, e.g. with terrain.rio.write_crs("EPSG:32633").'
+            'decode_coords="all", or set it, e.g. with terrain.rio.write_crs("EPSG:32633"); '
+            f"{see('howto/your-own-terrain')}."
         )
 
     stored = [_stored_array(terrain[name], name) for name in ("dem", "dsm")]
