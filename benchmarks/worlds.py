@@ -45,7 +45,6 @@ def beside_pooled(make: Any, scene: tb.study.Scene) -> dict[str, Any]:
 METHODS: dict[str, Any] = {
     OURS: {},
     "trustbo, greedy": {"policy": "greedy"},
-    "trustbo, explore": {"policy": "explore"},
     "trustbo, optimistic": {"policy": "optimistic"},
     "trustbo, places": {"model": tb.models.PooledTrust(effects=(tb.models.PlaceEffect(),))},
     "trustbo, no places": {"model": tb.models.PooledTrust(), "policy": "greedy"},
