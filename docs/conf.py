@@ -25,7 +25,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
 ]
-exclude_patterns = ["_build", "extensions"]
+exclude_patterns = ["_build", "extensions", "paper"]
 templates_path = ["_templates"]
 
 # Pages are Markdown. Notebooks are stored with their outputs and not executed here.
