@@ -25,6 +25,7 @@ from trustbo.plots.maps import (
     draw_ground,
     draw_path,
     draw_scale,
+    hatch_undriven,
     robust_limits,
 )
 from trustbo.plots.style import GREY, ROBOTS, outlined
@@ -109,7 +110,7 @@ def draw_bound(ax: Axes, plan: tb.planning.Plan) -> None:
     posts = plan.posts[BOUND - 1] - corner
     for share in (0.3, 0.65, 1.0):
         ends = np.broadcast_to(route[round(share * (len(route) - 1))], posts.shape)
-        sight = ax.plot(*np.stack([posts, ends], 1).T, color=GREY, linewidth=0.8)
+        sight = ax.plot(*np.stack([posts, ends], 1).T, color=GREY, linewidth=1.3)
     (moves,) = ax.plot(*route.T, color="black", linewidth=2.5)
     (lead,) = ax.plot(*route[0], "*", color="black", markersize=13, linestyle="none")
     ax.plot(*route[-1], "*", color="black", markersize=13, markerfacecolor="white")
@@ -139,19 +140,25 @@ def draw_trust(
     for values in maps:
         values[START] = np.nan  # the trust at the start is assumed
     low, _ = robust_limits(np.stack(maps))
+    driven = np.zeros((2, *workspace.grid.shape), dtype=bool)
+    for mission in result.missions:
+        for bound in mission.bounds:
+            driven[1, *bound.cell] = True
     norm = mpl.colors.Normalize(low, 1.0)  # 1: unbroken contact
     paths = [result.missions[0].path, result.path]
     titles = ["(c) trust by the old map, first path", f"(d) after {MISSIONS} missions, new path"]
     x, y = np.array(center) - workspace.grid.corner
-    for ax, values, path, title in zip(axes, maps, paths, titles, strict=True):
+    for ax, values, known, path, title in zip(axes, maps, driven, paths, titles, strict=True):
         image = draw_cells(ax, values, workspace, norm)
+        hatch_undriven(ax, known, workspace)
         draw_path(ax, path, workspace.grid)
         circle = Circle((x, y), RADIUS, fill=False, color="white", linestyle="--", linewidth=1.3)
         circle.set_path_effects(outlined(2.6, "black"))
         ax.add_patch(circle)
         ax.set(xticks=[], yticks=[], title=title)
         draw_scale(ax, workspace.grid)
-    figure.colorbar(image, ax=axes, extend="both", label="expected trust", shrink=0.9)
+    bar = figure.colorbar(image, ax=axes, extend="both", shrink=0.9)
+    bar.set_label("expected trust (1: unbroken contact)\nhatched: never entered, only predicted")
 
 
 def draw_lost(

@@ -35,7 +35,7 @@ FIGURES = {
     "plan_map": (lambda r, ax: plots.plan_map(r.plan, bounds=[1], ax=ax), 2),
     "trust_curves": (lambda r, ax: plots.trust_curves(r.posterior, ax=ax), 3),
     "trust_curves of a plan": (lambda r, ax: plots.trust_curves(r.plan, ax=ax), 3),
-    "campaign_history": (lambda r, ax: r.plot_history(ax=ax), 2),
+    "campaign_history": (lambda r, ax: r.plot_history(ax=ax), 1),
     "robot_effects": (lambda r, ax: plots.robot_effects(EFFECTS, ax=ax), 1),
     "grid_map": (lambda r, ax: plots.grid_map(r.workspace, ax=ax), 1),
 }
@@ -83,9 +83,10 @@ def test_too_few_axes_are_refused(result):
 
 def test_a_map_shows_the_values_of_passable_cells_in_metres(result):
     ax = plots.cell_map(result.trust_map, result.workspace, limits=(0.0, 1.0))
-    free = result.workspace.passable.values
+    known = result.workspace.passable.values.copy()
+    known[3, 0] = False  # the trust at the start is assumed
     shown = np.ma.filled(ax.images[0].get_array(), np.nan)
-    np.testing.assert_array_equal(shown, np.where(free, result.trust_map.values, np.nan))
+    np.testing.assert_array_equal(shown, np.where(known, result.trust_map.values, np.nan))
     assert tuple(ax.images[0].get_extent()) == extent_of(result.workspace.grid) == (0, 60, 0, 80)
 
 
@@ -110,6 +111,51 @@ def test_scales_of_trust_end_at_1_unless_trust_is_a_logit(high, limit):
     assert trust_limits(np.array([0.5, high] * 50)) == (0.5, limit)
 
 
+@pytest.mark.parametrize("name", ["trust_mean", "trust_sd", "cost", "path_probability"])
+def test_good_values_are_bright_and_assumed_ones_are_masked(result, name):
+    values = result.maps(n_draws=10)[name]
+    image = plots.cell_map(values, result.workspace).images[0]
+    assert np.ma.is_masked(image.get_array()[3, 0]) == (name != "path_probability")
+
+    red, green, _ = image.get_cmap()([0.0, 1.0])[:, :3].T
+    high_is_bright = (red + green)[1] > (red + green)[0]
+    assert high_is_bright == (name in ("trust_mean", "path_probability"))
+
+
+def test_a_scale_of_trust_says_that_values_exceed_it(result):
+    low = result.trust_map.copy(data=np.linspace(0.5, 0.9, 12).reshape(4, 3))
+    high = low + 0.2
+    for values, label in ((low, "0.90"), (high.assign_attrs(low.attrs), "≥ 1")):
+        ax = plots.cell_map(values.rename("trust"), result.workspace)
+        (bar,) = (other for other in ax.figure.axes if other is not ax)
+        ax.figure.canvas.draw()
+        assert [text.get_text() for text in bar.get_yticklabels()][-1] == label
+        assert "contact" not in bar.get_ylabel() or label == "≥ 1"
+
+
+def test_cells_that_no_mission_entered_are_hatched(result):
+    entered = [{bound.cell for bound in mission.bounds} for mission in result.missions]
+    driven = [set(), entered[0], entered[0] | entered[1]]
+    axes = result.plot_maps(missions=[1, 2])
+    for ax, known in zip(axes, driven, strict=True):
+        (hatched,) = (c for c in ax.collections if c.get_hatch())
+        new = ~np.ma.getmaskarray(hatched.get_array())
+        expected = result.workspace.passable.values.copy()
+        for cell in known:
+            expected[cell] = False
+        np.testing.assert_array_equal(new.reshape(expected.shape), expected)
+
+
+def test_contact_lost_is_measured_and_predicted_in_bounds_on_one_axis(result):
+    (ax,) = result.plot_history()
+    drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
+    np.testing.assert_allclose(drawn["predicted by the plan"], -result.history["objective"])
+    assert "bounds" in ax.get_ylabel()
+
+    other = result.history.assign_attrs(objective="mean")
+    assert len(plots.curves.campaign_history(other)) == 2
+
+
 def test_the_explorer_is_one_page_without_addresses(result, tmp_path):
     page = result.explore()
     page.save(tmp_path / "map.html")
@@ -117,6 +163,8 @@ def test_the_explorer_is_one_page_without_addresses(result, tmp_path):
     assert '<script src="http' not in html
     assert '<link rel="stylesheet" href="http' not in html
     assert "trust mean" in html
+    assert "<title>Path from 3,0 to 0,2 after 2 missions</title>" in html
+    assert len(repr(page)) < 100
     assert page._repr_html_().startswith("<iframe")
 
 

@@ -303,8 +303,8 @@ class Result(Summary):
         """Dataset of the quantities of each mission, with dim `iteration` (1, 2, ...).
 
         It contains the planned `path` (row and col of each step, -1 after the goal), the
-        `trust_map` used for planning, and the numbers and texts of `table`. Raises TrustboError if
-        there is no mission yet.
+        `trust_map` used for planning, and the numbers and texts of `table`. The attribute
+        `objective` is the name of the objective. Raises TrustboError if there is no mission yet.
         """
         entries = self.state.entries
         if not entries:
@@ -318,6 +318,7 @@ class Result(Summary):
         history = table.drop(columns=["where", "n_bounds", "path"]).to_xarray()
         history["path"] = ("iteration", "step", "axis"), steps
         history["trust_map"] = xr.concat([entry.trust_map for entry in entries], numbers)
+        history.attrs["objective"] = self.settings["objective"]
         return history.assign_coords(axis=["row", "col"])
 
     def table(self) -> pd.DataFrame:
@@ -357,7 +358,20 @@ class Result(Summary):
         """Plot trust maps and paths of four missions; see `plots.trust_maps` for the options."""
         from trustbo import plots  # imports matplotlib
 
+        options = {"driven": self._driven, **options}
         return plots.trust_maps(self.history, self.trust_map, self.path, self.workspace, **options)
+
+    @property
+    def _driven(self) -> np.ndarray:
+        """Whether each cell was entered before each mission and after the last, on this map."""
+        before = [mission for mission in self.state.earlier.missions if not mission.map]
+        driven = np.zeros((1 + len(self.missions), *self.workspace.grid.shape), dtype=bool)
+        for n, missions in enumerate([before, *([mission] for mission in self.missions)]):
+            for mission in missions:
+                cells = [bound.cell for bound in mission.bounds if bound.cell != NOWHERE]
+                for cell in cells:
+                    driven[n:, *cell] = True
+        return driven
 
     def plot_history(self, truth: Truth | None = None, **options: Any) -> np.ndarray:
         """Plot contact, objective and, given the simulator's truth, regret for each mission.

@@ -564,7 +564,8 @@ class Planner(Summary):
             mean `cost` of `cost_map`, the probability `path_probability` that a cell is on the best
             path (on the safest path if no path respects `max_failure`), with place effects also
             their `place_mean` and `place_sd`, and each feature, averaged over robots and moves (as
-            `awareness_<name>` if the name is taken). Impassable cells are NaN.
+            `awareness_<name>` if the name is taken). Impassable cells are NaN. The attribute
+            `start` of maps of trust and cost is the start, whose trust is assumed.
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         trust = trust_map(self.problem, params)
@@ -595,6 +596,8 @@ class Planner(Summary):
             maps[label] = mean, f"{name}, 0 worst, 1 best"
 
         dataset = xr.Dataset({name: v.assign_attrs(long_name=t) for name, (v, t) in maps.items()})
+        for name in ("trust_mean", "trust_sd", "cost"):
+            dataset[name].attrs["start"] = trust.attrs["start"]
         return self.workspace.grid.place(dataset.where(passable))
 
 

@@ -5,6 +5,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
+from trustbo.data import path_text
 from trustbo.models.draws import Draws
 from trustbo.planning.objectives import TERMINAL, weights_of
 from trustbo.planning.paths import SIMPLE_EXTRA, STEPS, AdmissiblePaths
@@ -32,7 +33,8 @@ def trust_map(
         trust = like.expand_dims(draw=len(values)).copy(data=values)
     else:
         trust = like.copy(data=values[0])
-    return trust.rename("trust").assign_attrs(long_name="expected trust")
+    start = path_text([problem.paths.start])  # where trust is assumed, see `plots`
+    return trust.rename("trust").assign_attrs(long_name="expected trust", start=start)
 
 
 def cost_of(trust: xr.DataArray) -> xr.DataArray:

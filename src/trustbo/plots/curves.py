@@ -21,6 +21,7 @@ from trustbo.plots.style import (
     as_text,
     background,
     ink,
+    is_broad,
     panels,
     styled,
 )
@@ -32,6 +33,12 @@ _LABELS = {
     "regret": "regret (%)",
 }
 """Axis labels of the variables that `campaign_history` plots, keyed by name."""
+_FEW_TICKS = 3
+"""Number of intervals between the ticks of a narrow panel."""
+_MARGIN = 0.1
+"""Space above and below the points of a panel, as a fraction of its height."""
+_LOST = "lost_contact"
+"""Objective that predicts minus the contact lost, in bounds."""
 SMALL_EFFECT = 0.1
 """Robot effect, as a fraction of contact, up to which plans hardly change."""
 _SPREAD = 0.2
@@ -77,7 +84,14 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
             panel.plot(x, rates[:, i], "o", color=ink(), markersize=3.5, label="contact rate")
         panel.set_title(as_text(name))
         panel.set_xlabel("bound")
-        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+        n_ticks = "auto" if is_broad(panel) else _FEW_TICKS
+        panel.xaxis.set_major_locator(MaxNLocator(n_ticks, integer=True))
+
+    limits = np.array([panel.get_ylim() for panel in axes])
+    for panel in axes:  # as the user's axes may have scales of their own
+        panel.set_ylim(limits[:, 0].min(), limits[:, 1].max())
+        if panel.get_subplotspec() is not None:
+            panel.label_outer()
 
     axes[0].set_ylabel("trust, contact rate")
     add_legend(axes, axes[0].get_legend_handles_labels()[0])
@@ -113,27 +127,41 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
     """Plot the contact, the objective and, if given, the regret of each mission.
 
     A filled dot marks a plan that differs from the previous plan. A cross marks a mission that did
-    not reach the goal.
+    not reach the goal. With the objective `lost_contact`, the contact lost as measured and as
+    predicted by the plan have one axis, in bounds; predictions include the costs of failures.
 
     Args:
         history: History of a campaign, `Result.history`; see `Result.plot_history` for regret.
         ax: Axes to draw on, one for each variable; by default a new figure.
 
     Returns:
-        Axes, shape (variable,): contact lost (or the contact rate), objective, and regret.
+        Axes, shape (variable,): contact lost (or the contact rate), the objective unless it is
+        plotted there, and regret.
     """
     names = [name for name in _LABELS if name in history]
     if "contact_lost" in names:
         names.remove("contact_rate")
+    predicted = None
+    if "contact_lost" in names and history.attrs.get("objective") == _LOST:
+        names.remove("objective")
+        predicted = -history["objective"].values
     mission = history["iteration"].values
     changed = history["path_changed"].values.astype(bool) | (mission == 1)
     failed = history["status"].values.astype(str) != "ok"
 
-    axes = panels(len(names), ax, (4.6, 1.5), columns=1, sharex=True)
+    height = 2.2 if len(names) == 1 else 1.6  # in inches
+    axes = panels(len(names), ax, (4.6, height), columns=1, sharex=True)
     for panel, name in zip(axes, names, strict=True):
         values = history[name].values
         panel.plot(mission, values, color=accent(), linewidth=1.0)
-        for which, fill, label in ((changed, accent(), "new path"), (~changed, "none", "same")):
+        if name == "contact_lost" and predicted is not None:
+            style: dict[str, Any] = {"color": ink(), "linestyle": ":", "linewidth": 1.2}
+            panel.plot(mission, predicted, marker=".", label="predicted by the plan", **style)
+
+        new, same = ("new path", "same path")
+        if name == "contact_lost":
+            new, same = (f"measured, {text}" for text in (new, same))
+        for which, fill, label in ((changed, accent(), new), (~changed, "none", same)):
             dots = {"markerfacecolor": fill, "markeredgecolor": accent(), "label": label}
             panel.plot(mission[which], values[which], "o", markersize=5.5, **dots)
 
@@ -141,6 +169,9 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
             cross = {"color": ROBOTS[1], "markersize": 9.0, "label": "goal not reached"}
             panel.plot(mission[failed], values[failed], "x", **cross)
         panel.set_ylabel(_LABELS[name])
+        panel.margins(y=_MARGIN)
+        if name == "contact_lost":
+            panel.set_ylim(bottom=min(0.0, *panel.get_ylim()))
 
     axes[-1].set_xlabel("mission")
     axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))

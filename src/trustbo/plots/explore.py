@@ -7,12 +7,23 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
 
-from trustbo.data import Cell
+from trustbo.data import Cell, path_text
 from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
-from trustbo.plots.maps import contours, extent_of, robust_limits, trust_limits
+from trustbo.plots.maps import (
+    BRIGHT_HIGH,
+    BRIGHT_LOW,
+    contours,
+    extent_of,
+    is_good_high,
+    is_trust,
+    robust_limits,
+    trust_limits,
+)
 from trustbo.plots.style import ROBOTS
 from trustbo.workspace.grid import Grid, over_cells
 
@@ -30,8 +41,10 @@ _UPDATE = """
 const n = mission.value
 const column = layer.value == planned_on ? `mission ${n}` : layer.value
 cells.data = {...cells.data, value: cells.data[column]}
+colours.palette = palettes[layer.value]
 colours.low = limits[column][0]
 colours.high = limits[column][1]
+bar.title = titles[layer.value]
 planned.data = paths[n - 1]
 text.text = texts[n - 1]
 """
@@ -78,7 +91,10 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
     from bokeh.embed import file_html  # imported here, as it takes half a second
     from bokeh.resources import INLINE
 
-    html = file_html(_layout(plan, maps, history), INLINE, title="trustbo")
+    n = history.sizes["iteration"]
+    start, goal = (path_text([cell]) for cell in (plan.path[0], plan.path[-1]))
+    title = f"Path from {start} to {goal} after {n} {'mission' if n == 1 else 'missions'}"
+    html = file_html(_layout(plan, maps, history), INLINE, title=title)
     viewport = '<meta name="viewport" content="width=device-width, initial-scale=1">'
     return Explorer(html.replace("<head>", f"<head>{viewport}", 1))
 
@@ -101,14 +117,20 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     position = {"x": x.ravel(), "y": y.ravel(), "cell_row": row.ravel(), "cell_col": col.ravel()}
     cells = models.ColumnDataSource({**position, **columns, "value": columns[names[0]]})
 
+    titles = {name: _title(name, maps, limits[name]) for name in names}
+    titles[_PLANNED_ON] = _title(_PLANNED_ON, maps, limits[names[0]])
+    palettes = {name: _palette(name) for name in titles}
+
     low, high = limits[names[0]]
     colours = models.LinearColorMapper(
-        palette="Viridis256", low=low, high=high, nan_color="#9a9a9a"
+        palette=palettes[names[0]], low=low, high=high, nan_color="#9a9a9a"
     )
+    bar = models.ColorBar(color_mapper=colours, height=12, title=titles[names[0]])
     plot = _plot_cells(plan, names, cells, colours)
+    plot.add_layout(bar, "below")
 
     paths = [_places(_cells(steps), grid) for steps in history["path"].values]
-    texts = [_text(history.isel(iteration=i)) for i in range(len(paths))]
+    texts = [_text(history.isel(iteration=i), plan.objective) for i in range(len(paths))]
     n_missions = len(paths)
     planned = models.ColumnDataSource(paths[-1])
     plot.line(
@@ -144,7 +166,10 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
         "layer": layer,
         "mission": mission,
         "text": text,
+        "bar": bar,
         "limits": limits,
+        "palettes": palettes,
+        "titles": titles,
         "paths": paths,
         "texts": texts,
         "planned_on": _PLANNED_ON,
@@ -187,7 +212,6 @@ def _plot_cells(plan: Plan, names: Sequence[str], cells: Any, colours: Any) -> A
     fill: Any = {"field": "value", "transform": colours}
     drawn = plot.rect("x", "y", source=cells, fill_color=fill, line_color=None, **size)
 
-    plot.add_layout(models.ColorBar(color_mapper=colours, height=12), "below")
     tips = [("cell", "@cell_row,@cell_col"), ("selected layer", "@value{0.000}")]
     tips += ((n, f"@{{{n}}}{{0.000}}") for n in names)
     plot.add_tools(models.HoverTool(renderers=[drawn], tooltips=tips))
@@ -257,11 +281,36 @@ def _places(path: Sequence[Cell], grid: Grid) -> dict[str, Any]:
     return {"x": x.tolist(), "y": y.tolist()}
 
 
-def _text(mission: xr.Dataset) -> str:
+def _palette(name: str) -> list[str]:
+    """Return 256 colours for a layer, from low to high values; good values are bright."""
+    colours = colormaps[BRIGHT_HIGH if is_good_high(name) else BRIGHT_LOW]
+    return [to_hex(colour) for colour in colours(np.linspace(0.0, 1.0, 256))]
+
+
+def _title(name: str, maps: xr.Dataset, limits: tuple[float, float]) -> str:
+    """Return the label of the colour bar for a layer."""
+    variable = maps.get(name.replace(" ", "_"))
+    text = name if variable is None else variable.attrs.get("long_name", name)
+    if is_trust(name) and limits[1] == 1.0:
+        return f"{text} (1 or more: unbroken contact)"
+    return str(text)
+
+
+def _text(mission: xr.Dataset, objective: str) -> str:
     """Describe a mission in one line of HTML."""
+    value = float(mission["objective"])
+    predicted = f"predicted objective {value:.3f}"
+    if objective == "lost_contact":
+        predicted = f"contact lost {_lost(mission)}, predicted {-value:.2f} bounds"
     return (
         f"<b>Mission {int(mission['iteration'])}</b>: {escape(str(mission['status'].item()))}, "
         f"contact rate {float(mission['contact_rate']):.3f}, "
         f"plan of {len(_cells(mission['path'].values)) - 1} bounds, "
-        f"predicted objective {float(mission['objective']):.3f}"
+        f"{predicted}"
     )
+
+
+def _lost(mission: xr.Dataset) -> str:
+    """Return the contact that a mission lost, as text."""
+    lost = float(mission["contact_lost"]) if "contact_lost" in mission else np.nan
+    return f"{lost:.2f}" if np.isfinite(lost) else "not measured"

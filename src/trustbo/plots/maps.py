@@ -11,11 +11,25 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, ListedColormap, Normalize
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter
 from scipy.ndimage import gaussian_filter
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_list, require_tuple, require_whole
-from trustbo.plots.style import GREY, as_text, background, ink, outlined, panels, styled
+from trustbo.plots.style import (
+    GREY,
+    add_legend,
+    as_text,
+    background,
+    figure_of,
+    ink,
+    is_broad,
+    outlined,
+    panels,
+    styled,
+)
 from trustbo.terrain import pixel_size
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid, over_cells
@@ -41,6 +55,14 @@ _BESIDE = 1.1
 """Width of axis labels and colour bar, in inches."""
 _LOGIT = 1.5
 """Trust above this value is on the logit scale of beta-binomial models."""
+BRIGHT_HIGH = "viridis"
+"""Colours of maps in which high values are good."""
+BRIGHT_LOW = "viridis_r"
+"""Colours of maps in which low values are good."""
+_WIDE_ENOUGH = 4.0
+"""Width of a figure, in inches, from which the label of a colour bar may explain its ends."""
+_HATCH = {"hatch": "////", "edgecolor": (0.4, 0.4, 0.4, 0.65), "linewidth": 0.0}
+"""Style of cells that no mission entered."""
 _LONGEST_BAR = 0.4
 """Longest scale bar, as a fraction of the width of a map."""
 _BAR_END = 0.96
@@ -55,13 +77,15 @@ def trust_maps(
     workspace: Workspace,
     *,
     missions: Sequence[int] = MOMENTS,
+    driven: np.ndarray | None = None,
     ax: Any = None,
 ) -> np.ndarray:
     """Plot the trust maps used to plan missions, and the planned paths (Fig. 5 of the paper).
 
     The last panel shows the map and the recommended path after the last mission. All maps share one
     colour scale, from the 2 % to the 98 % quantile of the learned maps. The start is grey because
-    its trust is assumed. A trust slightly above 1 has the colour of 1 (unbroken contact).
+    its trust is assumed. A trust slightly above 1 has the colour of 1 (unbroken contact): estimates
+    of Gaussian rates are not limited to 1.
 
     Args:
         history: Trust map and path of each mission, such as `Result.history`.
@@ -69,7 +93,9 @@ def trust_maps(
         path: Path recommended after the last mission, such as `Result.path`.
         workspace: Workspace of the cells.
         missions: Numbers of missions, from 1; missions that were not run are skipped.
-        ax: Axes to draw on, one for each panel; by default a new figure.
+        driven: Whether each cell had been entered before each mission and after the last one, shape
+            (mission + 1, row, col). Other cells are hatched, as their trust is only predicted.
+        ax: Axes to draw on, one for each panel; by default a new figure with a legend.
 
     Returns:
         Axes, shape (panel,).
@@ -96,20 +122,36 @@ def trust_maps(
     axes = map_panels(workspace.grid, len(maps), ax)
     for panel, trust, cells, n in zip(axes, values, paths, learned, strict=True):
         draw_cells(panel, maps[0].copy(data=trust), workspace, norm)
+        if driven is not None:
+            hatch_undriven(panel, np.asarray(driven)[n], workspace)
         draw_path(panel, cells, workspace.grid)
-        panel.set_title(_moment(n))
+        panel.set_title(_moment(n, panel))
 
     draw_scale(axes[0], workspace.grid)
-    unit = "\n(1: unbroken contact)" if high <= 1.0 else ""
-    colour_bar(axes, ScalarMappable(norm), f"expected trust{unit}", extend="both")
+    shown = np.where(workspace.passable.values, values, np.nan)
+    trust_bar(axes, ScalarMappable(norm), shown, "expected trust")
+    if ax is None:
+        add_legend(axes, _legend(driven is not None))
     return axes
 
 
-def _moment(n: int) -> str:
-    """Describe the moment after n missions."""
-    if n == 0:
-        return "before the first mission"
-    return "after 1 mission" if n == 1 else f"after {n} missions"
+def _moment(n: int, panel: Axes) -> str:
+    """Describe the moment after n missions, in two lines if the panel is narrow."""
+    words = ("before", "mission 1") if n == 0 else ("after", f"mission {n}")
+    return (" " if is_broad(panel) else "\n").join(words)
+
+
+def _legend(hatched: bool) -> list[Line2D | Patch]:
+    """Return the legend of maps with a path."""
+    white: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": "none"}
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], marker="o", markersize=6, label="start", **white),
+        Line2D([], [], marker="*", markersize=11, label="goal", **white),
+        Patch(facecolor=GREY, label="impassable or start"),
+    ]
+    if hatched:
+        handles.append(Patch(facecolor="0.9", label="never entered", **_HATCH))
+    return handles
 
 
 @styled
@@ -173,13 +215,19 @@ def cell_map(
 ) -> Axes:
     """Plot a map of the planning cells with contour lines; impassable cells are grey.
 
+    Bright cells are good: the colours are reversed for costs and standard deviations, which are
+    recognised by the names `cost` and `..._sd`. The start is grey in maps of trust and cost (see
+    the attribute `start` of `Result.maps`) because its trust is assumed.
+
     Args:
         values: Map with the dims (row, col), or (y, x) as in `Result.maps`.
         workspace: Workspace of the cells.
         path: Path to draw.
-        limits: Values at the ends of the colour scale; by default the range of the map.
+        limits: Values at the ends of the colour scale; by default the range of the map, up to 1 if
+            trust is slightly above 1.
         cmap: Matplotlib `Colormap` or its name.
-        label: Label of the colour bar; by default the name of the map; `""` for no colour bar.
+        label: Label of the colour bar; by default the long name or the name of the map; `""` for no
+            colour bar.
         ax: Axes to draw on; by default a new figure.
 
     Returns:
@@ -187,10 +235,13 @@ def cell_map(
     """
     require_kind("values", values, xr.DataArray, "give a map of the cells")
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
+    shown = shown_values(values, workspace)
     norm = Normalize()
     if limits is not None:
         low, high = require_tuple("limits", limits, 2)
         norm = Normalize(low, high)
+    elif is_trust(str(values.name)) and np.isfinite(shown).any():
+        norm = Normalize(*up_to_contact(float(np.nanmin(shown)), float(np.nanmax(shown))))
     if label is not None:
         require_kind("label", label, str, "give a text; '' for no colour bar")
     cells = None if path is None else require_path_of_cells(path, workspace)
@@ -202,8 +253,23 @@ def cell_map(
         draw_path(axes[0], cells, workspace.grid)
     draw_scale(axes[0], workspace.grid)
     if label != "":
-        colour_bar(axes, image, label or as_text(values.name or ""))
+        name = values.attrs.get("long_name", values.name)
+        text = label or as_text(name or "")
+        if is_trust(str(values.name)):
+            trust_bar(axes, image, shown, text)
+        else:
+            colour_bar(axes, image, text, extend=_extend(shown, norm))
     return axes[0]
+
+
+def is_trust(name: str) -> bool:
+    """Return whether a map with this name has values of trust."""
+    return name.startswith("trust") and is_good_high(name)
+
+
+def is_good_high(name: str) -> bool:
+    """Return whether high values are good in a map with this name, unlike in maps of cost."""
+    return name != "cost" and not name.endswith(("_sd", " sd"))
 
 
 def require_path_of_cells(path: Sequence[Cell], workspace: Workspace) -> list[Cell]:
@@ -243,10 +309,37 @@ def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
     return axes
 
 
-def colour_bar(axes: Sequence[Axes] | np.ndarray, image: Any, label: str, **options: Any) -> None:
-    """Draw a colour bar beside axes."""
+def colour_bar(axes: Sequence[Axes] | np.ndarray, image: Any, label: str, **options: Any) -> Any:
+    """Draw a colour bar beside axes, and return it."""
     bar = axes[0].figure.colorbar(image, ax=list(axes), pad=0.02, **options)
     bar.set_label(label)
+    return bar
+
+
+def trust_bar(
+    axes: Sequence[Axes] | np.ndarray, image: Any, values: np.ndarray, label: str
+) -> None:
+    """Draw a colour bar of trust, whose upper end says so if values exceed unbroken contact."""
+    bar = colour_bar(axes, image, label, extend=_extend(values, image.norm))
+    if image.norm.vmax != 1.0:
+        return
+
+    room = figure_of(axes).get_figwidth() >= _WIDE_ENOUGH
+    is_above = bool((values[np.isfinite(values)] > 1.0).any())
+    if room:
+        more = ";\nestimates can be higher" if is_above else ""
+        bar.set_label(f"{label}\n(1: unbroken contact{more})")
+    if is_above:
+        bar.formatter = FuncFormatter(lambda x, _: "≥ 1" if math.isclose(x, 1.0) else f"{x:.4g}")
+        bar.update_ticks()
+
+
+def _extend(values: np.ndarray, norm: Normalize) -> str:
+    """Return at which ends of a colour scale there are values beyond it."""
+    found = values[np.isfinite(values)]
+    below = bool((found < norm.vmin).any()) if norm.vmin is not None else False
+    above = bool((found > norm.vmax).any()) if norm.vmax is not None else False
+    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
 
 
 def draw_cells(
@@ -256,14 +349,35 @@ def draw_cells(
     norm: Normalize,
     cmap: str | Colormap | None = None,
 ) -> Any:
-    """Draw a map of the planning cells, and return the image."""
-    shown = over_cells(values).transpose("row", "col").values
-    data = np.where(workspace.passable.values, shown, np.nan)
+    """Draw a map of the planning cells, and return the image; see `cell_map` for the colours."""
+    if cmap is None:
+        cmap = BRIGHT_HIGH if is_good_high(str(values.name)) else BRIGHT_LOW
 
     ax.set_facecolor(GREY)
+    data = shown_values(values, workspace)
     image = ax.imshow(data, cmap=cmap, norm=norm, extent=extent_of(workspace.grid))
     draw_contours(ax, workspace, "black", 0.25)
     return image
+
+
+def shown_values(values: xr.DataArray, workspace: Workspace) -> np.ndarray:
+    """Return a map (row, col) with NaN in impassable cells and where trust is assumed."""
+    shown = over_cells(values).transpose("row", "col").values
+    shown = np.where(workspace.passable.values, shown, np.nan)
+    if "start" in values.attrs:
+        row, col = values.attrs["start"].split(",")
+        shown[int(row), int(col)] = np.nan
+    return shown
+
+
+def hatch_undriven(ax: Axes, driven: np.ndarray, workspace: Workspace) -> None:
+    """Hatch the passable cells that were not `driven`, shape (row, col)."""
+    left, right, bottom, top = extent_of(workspace.grid)
+    rows, cols = workspace.grid.shape
+    x = np.linspace(left, right, cols + 1)
+    y = np.linspace(top, bottom, rows + 1)
+    new = np.ma.masked_array(np.ones((rows, cols)), driven | ~workspace.passable.values)
+    ax.pcolor(x, y, new, cmap=ListedColormap(["none"]), **_HATCH)
 
 
 def draw_ground(ax: Axes, workspace: Workspace) -> None:
@@ -349,7 +463,11 @@ def robust_limits(values: np.ndarray) -> tuple[float, float]:
 
 def trust_limits(values: np.ndarray) -> tuple[float, float]:
     """Return `robust_limits`, where an upper limit just above 1 (unbroken contact) becomes 1."""
-    low, high = robust_limits(values)
+    return up_to_contact(*robust_limits(values))
+
+
+def up_to_contact(low: float, high: float) -> tuple[float, float]:
+    """Lower the upper end of a scale of trust to 1 if it is just above; see `trust_limits`."""
     if low < 1.0 < high < _LOGIT:
         high = 1.0
     return low, high
@@ -369,7 +487,16 @@ def draw_scale(ax: Axes, grid: Grid) -> None:
     bar.set(solid_capstyle="butt", path_effects=outlined(4.0, background()))
 
     label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
-    text = ax.text(_BAR_END, 0.065, label, ha="right", color=ink(), transform=ax.transAxes)
+    text = ax.annotate(
+        label,
+        (_BAR_END, 0.045),
+        (0.0, 2.5),  # points above the bar
+        xycoords="axes fraction",
+        textcoords="offset points",
+        ha="right",
+        va="bottom",
+        color=ink(),
+    )
     text.set_path_effects(outlined(2.5, background()))
 
 

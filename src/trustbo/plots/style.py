@@ -39,6 +39,8 @@ GREY = "0.55"
 """Colour of impassable cells and auxiliary lines, for light and dark backgrounds."""
 PAGE = 7.6
 """Page width in inches, which is the maximum width of a new figure."""
+_BROAD = 1.5
+"""Width of a panel, in inches, from which a title of two words and a legend fit into it."""
 _WIDE = 5.0
 """Width of a figure, in inches, from which a legend has four columns instead of two."""
 
@@ -106,14 +108,22 @@ def figure_of(axes: Sequence[Axes] | np.ndarray) -> Figure:
 
 
 def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
-    """Add a legend below the axes or, without a constrained layout, inside the first axes."""
+    """Add a legend below the axes or, without a constrained layout, inside the first axes.
+
+    Without a constrained layout, narrow axes have no legend, which would hide the data.
+    """
     figure = figure_of(axes)
     if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
         most = 4 if figure.get_figwidth() >= _WIDE else 2
         columns = min(len(handles), most)
         figure.legend(handles=list(handles), loc="outside lower center", ncols=columns)
-    else:
+    elif is_broad(axes[0]):
         axes[0].legend(handles=list(handles))
+
+
+def is_broad(panel: Axes) -> bool:
+    """Return whether a panel is wide enough for a title of two words, or for a legend."""
+    return figure_of([panel]).get_figwidth() * panel.get_position().width >= _BROAD
 
 
 def accent() -> str:
