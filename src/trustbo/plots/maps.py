@@ -256,7 +256,7 @@ def cell_map(
         name = values.attrs.get("long_name", values.name)
         text = label or as_text(name or "")
         if is_trust(str(values.name)):
-            trust_bar(axes, image, shown, text)
+            trust_bar(axes, image, shown, text, explain=label is None)
         else:
             colour_bar(axes, image, text, extend=_extend(shown, norm))
     return axes[0]
@@ -317,16 +317,23 @@ def colour_bar(axes: Sequence[Axes] | np.ndarray, image: Any, label: str, **opti
 
 
 def trust_bar(
-    axes: Sequence[Axes] | np.ndarray, image: Any, values: np.ndarray, label: str
+    axes: Sequence[Axes] | np.ndarray,
+    image: Any,
+    values: np.ndarray,
+    label: str,
+    *,
+    explain: bool = True,
 ) -> None:
-    """Draw a colour bar of trust, whose upper end says so if values exceed unbroken contact."""
+    """Draw a colour bar of trust, whose upper end says so if values exceed unbroken contact.
+
+    Unless `explain` is false, the label of a bar in a wide figure explains this end.
+    """
     bar = colour_bar(axes, image, label, extend=_extend(values, image.norm))
     if image.norm.vmax != 1.0:
         return
 
-    room = figure_of(axes).get_figwidth() >= _WIDE_ENOUGH
     is_above = bool((values[np.isfinite(values)] > 1.0).any())
-    if room:
+    if explain and figure_of(axes).get_figwidth() >= _WIDE_ENOUGH:
         more = ";\nestimates can be higher" if is_above else ""
         bar.set_label(f"{label}\n(1: unbroken contact{more})")
     if is_above:
