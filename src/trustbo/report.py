@@ -12,6 +12,7 @@ from arviz_stats.summary import summary
 
 from trustbo import plots
 from trustbo.campaign.result import Result
+from trustbo.data import Cell
 from trustbo.display import render
 from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
@@ -38,17 +39,20 @@ class _Block(NamedTuple):
 
 
 class _Section(NamedTuple):
-    """Section of the page."""
+    """Section of the page; `on_screen` sections are not printed."""
 
     heading: str
     blocks: list[_Block]
+    on_screen: bool = False
 
 
 def write_report(path: FilePath, result: Result) -> None:
     """Write a result as one self-contained HTML page.
 
-    The page begins with the recommended path and its predicted contact and risk. The trust map,
-    the missions, the uncertainty, the diagnostics and the settings follow.
+    The first screen shows the recommended path on the terrain with the overwatch posts, the contact
+    in each mission, the probability of arrival, and what is uncertain. Tables with the coordinates
+    of all stops, maps, diagnostics and settings follow. The page prints on two sheets, without
+    diagnostics and settings.
 
     Args:
         path: File to write.
@@ -64,12 +68,13 @@ def write_report(path: FilePath, result: Result) -> None:
     page = render(
         "report.html",
         title=f"Recommended path after {missions}",
-        facts=_facts(result),
+        facts=facts_of(result),
+        pictures=[_path_map(result), _image(result.plot_history, "contact lost in each mission")],
         sections=[
-            _path(result.plan),
-            _trust(result),
+            _bounds(result),
             _missions(result),
-            _uncertainty(result),
+            _maps(result),
+            _weakest(result.plan),
             _diagnostics(result),
             _settings(result),
         ],
@@ -77,7 +82,7 @@ def write_report(path: FilePath, result: Result) -> None:
     write_text(path, page)
 
 
-def _facts(result: Result) -> dict[str, str]:
+def facts_of(result: Result) -> dict[str, str]:
     """Return the facts, by name, that are needed to decide whether to drive the path."""
     plan = result.plan
     problem = result.planner.problem
@@ -91,51 +96,124 @@ def _facts(result: Result) -> dict[str, str]:
     facts = {
         "Path": f"{cells} (row,column; row 0 is north)",
         "Length": f"{len(plan.path) - 1} bounds, {plan.length:.0f} m",
+    }
+
+    if plan.p_arrive is not None and plan.risk is not None:
+        low, high = plan.risk.p_arrive_band
+        band = f", {low:.0%} to {high:.0%} in 90 % of the draws" if np.isfinite(low) else ""
+        facts["Probability of arrival"] = (
+            f"{plan.p_arrive:.1%}{band}, given the robots' slope limit"
+        )
+    return facts | {
         "Expected contact": f"{contact.mean():.1%} of the time, averaged over robots and bounds",
         "Weakest bound": f"bound {worst + 1} into cell {_name(plan.path[worst + 1])}, "
         f"expected contact {contact[worst]:.1%}",
+        "Uncertain": _uncertain(result),
         "Last mission": f"status {result.missions[-1].status}, contact {last}",
         "Reason for stopping": _ENDS.get(result.stop_reason, result.stop_reason),
     }
-    if plan.p_arrive is not None:
-        facts["Probability of arrival"] = f"{plan.p_arrive:.1%}, given the robots' slope limit"
-    return facts
 
 
-def _path(plan: Plan) -> _Section:
-    """Plot the recommended path if there is a terrain, and make a table of its bounds."""
-    blocks = []
+def _uncertain(result: Result) -> str:
+    """Return which parts of the path are uncertain, as text."""
+    plan = result.plan
+    new = [_name(cell) for cell in plan.path[1:] if cell not in _driven(result)]
+    known = "every cell of the path was entered in a mission"
+    if new:
+        known = f"{len(new)} of {len(plan.path) - 1} cells were never entered: {', '.join(new)}"
+
+    low, high = (band.mean(1) for band in (plan.bands[0], plan.bands[-1]))
+    widest = int(np.argmax(high - low))
+    text = (
+        f"{known}; trust is least certain in bound {widest + 1} into cell "
+        f"{_name(plan.path[widest + 1])}, {low[widest]:.2f} to {high[widest]:.2f} with 90 % "
+        "probability"
+    )
+    if plan.value_band is not None:
+        text += (
+            f"; the objective is {plan.value:.3g} ({plan.value_band[0]:.3g} to "
+            f"{plan.value_band[1]:.3g} in 90 % of the draws)"
+        )
+    return text
+
+
+def _driven(result: Result) -> set[Cell]:
+    """Return the cells that were entered in a mission."""
+    return {bound.cell for mission in result.missions for bound in mission.bounds}
+
+
+def _path_map(result: Result) -> _Block:
+    """Plot the path on the terrain with all posts or, without a terrain, on the trust map."""
+    plan = result.plan
     if plan.stops is not None:
-        weakest = sorted((np.argsort(plan.trust.mean(1))[:_SHOWN] + 1).tolist())
-        blocks += [
-            _image(lambda: plots.plan_map(plan, bounds=weakest), "path, posts and routes"),
-            _note(
-                "The first map shows the path from start (circle) to goal (star). The others show "
-                "the bounds with the least trust. The robots watch from their posts while the lead "
-                "drives, and then drive to their next posts."
-            ),
-        ]
+        return _image(lambda: plots.plan_map(plan, bounds=[]), "path and overwatch posts")
+    draw = plots.cell_map
+    return _image(lambda: draw(result.trust_map, plan.workspace, path=plan.path), "path")
 
+
+def _bounds(result: Result) -> _Section:
+    """Make a table of the bounds of the path, with coordinates."""
+    plan = result.plan
     low, high = plan.bands[0], plan.bands[-1]
-    table = pd.DataFrame({
-        "cell": [_name(cell) for cell in plan.path[1:]],
-        "expected trust": plan.trust.mean(1),
-        "5 %": low.mean(1),
-        "95 %": high.mean(1),
-    }, index=pd.RangeIndex(1, len(plan.path), name="bound"))  # fmt: skip
-    return _Section("Recommended path", [*blocks, _table(table)])
+    driven = _driven(result)
+    positions = plan.positions if plan.stops is None else plan.stops
+
+    columns: dict[str, Any] = {
+        "cell": [_name(cell) for cell in plan.path],
+        "x (m)": [f"{x:.1f}" for x in positions[:, 0]],
+        "y (m)": [f"{y:.1f}" for y in positions[:, 1]],
+        "expected trust": [np.nan, *plan.trust.mean(1)],
+        "5 %": [np.nan, *low.mean(1)],
+        "95 %": [np.nan, *high.mean(1)],
+    }
+    if plan.p_fail is not None:
+        columns["p(failure)"] = [np.nan, *plan.p_fail]
+    columns["entered"] = ["start", *("yes" if c in driven else "no" for c in plan.path[1:])]
+
+    table = pd.DataFrame(columns, index=pd.RangeIndex(len(plan.path), name="bound"))
+    where = "centre of the cell" if plan.stops is None else "stop of the lead"
+    note = f"x and y: {where}, {plan.workspace.grid.crs_name}. Bound 0 is the start."
+    return _Section("Bounds of the path", [_table(table), _note(note)])
 
 
-def _trust(result: Result) -> _Section:
+def _weakest(plan: Plan) -> _Section:
+    """Plot the bounds with the least trust, if there is a terrain."""
+    if plan.stops is None:
+        return _Section("Weakest bounds", [_note("Without a terrain, there are no posts.")])
+
+    weakest = sorted((np.argsort(plan.trust.mean(1))[:_SHOWN] + 1).tolist())
+    text = (
+        "The bounds with the least trust. The robots watch from their posts while the lead drives, "
+        "and then drive to their next posts."
+    )
+    return _Section(
+        "Weakest bounds",
+        [
+            _image(lambda: plots.plan_map(plan, bounds=weakest), "posts and routes of bounds"),
+            _note(text),
+        ],
+    )
+
+
+def _maps(result: Result) -> _Section:
+    """Plot the trust maps of missions and the standard deviation of trust."""
+    plan = result.plan
     is_logit = result.settings["family"] == "beta_binomial"
     scale = "Trust is the logit of contact." if is_logit else "A trust of 1 means unbroken contact."
+    sd = result.maps(n_draws=_DRAWS)["trust_sd"]
     return _Section(
-        "Trust map",
+        "Trust and its uncertainty",
         [
             _image(result.plot_maps, "trust maps after selected missions"),
+            _image(
+                lambda: plots.cell_map(sd, result.workspace, path=plan.path),
+                "standard deviation of trust",
+            ),
             _note(
                 f"Expected trust in each cell, and the path planned with this trust. {scale} "
-                "Impassable cells are grey, and so is the start, whose trust is assumed."
+                "Bright cells are good: high trust, or a small standard deviation. Trust in "
+                "hatched cells is only predicted from a map that may be outdated. The intervals assume an "
+                "adequate model (see trustbo.criticism)."
             ),
         ],
     )
@@ -145,48 +223,19 @@ def _missions(result: Result) -> _Section:
     table = result.table()
     columns = ("status", "contact_rate", "contact_lost", "objective", "n_bounds")
     shown = table.loc[:, [name for name in columns if name in table]].rename_axis("mission")
+    about = f"The objective is {result.settings['objective'].replace('_', ' ')}."
+    if result.settings["objective"] == "lost_contact":
+        shown["objective"] = -shown["objective"]
+        shown = shown.rename(columns={"objective": "predicted_lost"})
+        about = "Contact lost is in bounds; predictions include the costs of failures."
     shown.columns = [str(name).replace("_", " ") for name in shown.columns]
     return _Section(
         "Contact in each mission",
         [
-            _image(result.plot_history, "contact and objective of each mission"),
             _table(shown),
             _note(
-                f"The objective ({result.settings['objective'].replace('_', ' ')}) is the value "
-                "predicted for the plan of a mission, based on all earlier missions."
-            ),
-        ],
-    )
-
-
-def _uncertainty(result: Result) -> _Section:
-    plan = result.plan
-    maps = result.maps(n_draws=_DRAWS)
-    driven = {bound.cell for mission in result.missions for bound in mission.bounds}
-    new = [_name(cell) for cell in plan.path[1:] if cell not in driven]
-    known = "Every cell of the path was entered in a mission."
-    if new:
-        known = f"Cells of the path that were never entered: {', '.join(new)}."
-    band = ""
-    if plan.value_band is not None:
-        low, high = plan.value_band
-        band = (
-            f"The objective is {plan.value:.3g}, with a 90 % interval of {low:.3g} to {high:.3g}; "
-            "only the objective limits trust to 1, so it can lie outside."
-        )
-    return _Section(
-        "Uncertainty",
-        [
-            _image(
-                lambda: plots.cell_map(
-                    maps["trust_sd"], result.workspace, path=plan.path, label="sd of expected trust"
-                ),
-                "standard deviation of trust",
-            ),
-            _note(
-                f"{known} {band} The intervals assume an adequate model (see trustbo.criticism). "
-                "In cells that were never entered, trust is predicted from a map that may be "
-                "outdated."
+                f"{about} The value predicted for the plan of a mission is based on all earlier "
+                "missions. Printed pages have the last 12 missions."
             ),
         ],
     )
@@ -212,6 +261,7 @@ def _diagnostics(result: Result) -> _Section:
             _table(pd.Series(rows, name="value").rename_axis("diagnostic").to_frame()),
             _table(table[kept].rename_axis("parameter")),
         ],
+        on_screen=True,
     )
 
 
@@ -223,10 +273,11 @@ def _settings(result: Result) -> _Section:
         [
             _table(pd.Series(short, name="value").rename_axis("setting").to_frame()),
         ],
+        on_screen=True,
     )
 
 
-def _name(cell: tuple[int, int]) -> str:
+def _name(cell: Cell) -> str:
     return f"{cell[0]},{cell[1]}"
 
 

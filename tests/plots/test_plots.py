@@ -1,6 +1,7 @@
 """Figures: they draw on new axes and on those of the user, and show the numbers given."""
 
 import re
+from copy import copy
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -11,7 +12,7 @@ import pytest
 import trustbo as tb
 from trustbo import plots
 from trustbo.plots.maps import contour_interval, contours, draw_path, extent_of, trust_limits
-from trustbo.report import write_report
+from trustbo.report import facts_of, write_report
 
 EFFECTS = pd.DataFrame(
     [
@@ -172,8 +173,41 @@ def test_the_report_is_one_page_with_the_path_and_every_figure(result, tmp_path)
     write_report(tmp_path / "report.html", result)
     html = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "→".join(f" {row},{col} " for row, col in result.path).strip() in html
-    assert html.count('src="data:image/png;base64,') == 4
+    assert html.count('src="data:image/png;base64,') == 5
     assert "http" not in html
+
+    first, *_ = html.partition("<section")
+    assert f"{result.plan.p_arrive:.1%}" in first
+    assert first.count("<img") == 2
+
+    cells = [f"{row},{col}" for row, col in result.path]
+    for cell, (x, y) in zip(cells, result.plan.stops, strict=True):
+        assert f"<td>{cell}</td>\n      <td>{x:.1f}</td>\n      <td>{y:.1f}</td>" in html
+    assert result.workspace.grid.crs_name in html
+
+
+def test_the_report_lists_the_cells_of_the_path_that_were_never_entered(result):
+    entered = {bound.cell for mission in result.missions for bound in mission.bounds}
+    longer = [(3, 0), (3, 1), (3, 2), (2, 2), (1, 2), (0, 2)]
+    new = [f"{row},{col}" for row, col in longer[1:] if (row, col) not in entered]
+    assert new
+
+    other = copy(result)
+    other._computed = dict(result._computed)
+    other._computed["plan"] = result.planner.evaluate(longer, result.forecast)
+    assert f"never entered: {', '.join(new)};" in facts_of(other)["Uncertain"]
+
+
+@pytest.mark.parametrize(("bounds", "n"), [([], 1), ([2], 2)])
+def test_the_map_of_the_path_alone_shows_all_posts(result, bounds, n):
+    axes = plots.plan_map(result.plan, bounds=bounds)
+    assert len(axes) == n
+    corner = np.array(result.workspace.grid.corner)
+    drawn = [line.get_xydata() for line in axes[0].lines]
+    for i in range(result.workspace.team.n_robots):
+        posts = result.plan.posts[:, i] - corner
+        found = any(a.shape == posts.shape and np.allclose(a, posts) for a in drawn)
+        assert found == (n == 1)
 
 
 def test_the_report_has_contact_and_not_the_logit_of_it(result, tmp_path):

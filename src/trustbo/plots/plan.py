@@ -17,6 +17,8 @@ _DASHED = (0, (3, 1.5))
 """Line style of the routes between posts."""
 _HALF = 0.56
 """Half the width of the map of a bound, relative to what it must show."""
+_SMALL = 4.0
+"""Size of the posts in the map of the path, in points."""
 _LEAST_HALF = 2.0
 """Half the width of a map that shows a single point, m."""
 
@@ -30,7 +32,8 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
 
     Args:
         plan: Plan on a terrain, such as `Result.plan`.
-        bounds: Numbers of the bounds to plot, from 1; by default all.
+        bounds: Numbers of the bounds to plot, from 1; by default all. `[]` plots only the
+            path, with the posts of all bounds.
         ax: Axes to draw on, one for the path and one for each bound; by default a new figure.
 
     Returns:
@@ -47,10 +50,13 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     for k in shown:
         require_whole("bounds: a number", k, 1, n_bounds)
 
-    axes = panels(1 + len(shown), ax, (2.5, 2.6))
+    size = (2.5, 2.6) if len(shown) else (5.0, 4.4)  # in inches
+    axes = panels(1 + len(shown), ax, size)
     for panel in axes:
         draw_ground(panel, plan.workspace)
     draw_path(axes[0], plan.path, plan.workspace.grid)
+    if not len(shown):
+        _draw_posts(axes[0], plan)
     draw_scale(axes[0], plan.workspace.grid)
     axes[0].set_title(f"path of {n_bounds} bounds")
 
@@ -59,8 +65,18 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
         (a, b), (c, d) = plan.path[k - 1 : k + 1]
         panel.set_title(f"bound {k}\n{a},{b} to {c},{d}")
 
-    add_legend(axes, _legend(plan.workspace.team.names))
+    names = plan.workspace.team.names
+    add_legend(axes, _legend(names) if len(shown) else _legend_of_path(names))
     return axes
+
+
+def _draw_posts(ax: Axes, plan: Plan) -> None:
+    """Plot the posts of all bounds as small markers."""
+    posts = plan.posts
+    assert posts is not None  # noqa: S101
+    for i, positions in enumerate(np.swapaxes(posts - np.array(plan.workspace.grid.corner), 0, 1)):
+        style = _filled(ROBOTS[i % len(ROBOTS)], _SMALL)
+        ax.plot(*positions.T, MARKERS[i % len(MARKERS)], **style, linestyle="none", zorder=7)
 
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
@@ -105,6 +121,22 @@ def _window(middle: float, half: float, low: float, high: float) -> tuple[float,
     width = min(2.0 * half, high - low)
     left = float(np.clip(middle - width / 2.0, low, high - width))
     return left, left + width
+
+
+def _legend_of_path(names: Sequence[str]) -> list[Line2D | Patch]:
+    """Return the legend of the map of the path."""
+    white: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": "none"}
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], marker="o", markersize=6, label="start", **white),
+        Line2D([], [], marker="*", markersize=11, label="goal", **white),
+    ]
+    for i, name in enumerate(names):
+        marker = MARKERS[i % len(MARKERS)]
+        style = _filled(ROBOTS[i % len(ROBOTS)], _SMALL)
+        handles.append(
+            Line2D([], [], marker=marker, linestyle="none", label=f"posts: {name}", **style)
+        )
+    return [*handles, Patch(facecolor=VEGETATION, label="vegetation")]
 
 
 def _legend(names: Sequence[str]) -> list[Line2D | Patch]:
