@@ -212,8 +212,8 @@ def _maps(result: Result) -> _Section:
             _note(
                 f"Expected trust in each cell, and the path planned with this trust. {scale} "
                 "Bright cells are good: high trust, or a small standard deviation. Trust in "
-                "hatched cells is only predicted from a map that may be outdated. The intervals assume an "
-                "adequate model (see trustbo.criticism)."
+                "hatched cells is only predicted from a map that may be outdated. The intervals "
+                "assume an adequate model (see trustbo.criticism)."
             ),
         ],
     )

@@ -158,9 +158,9 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
             style: dict[str, Any] = {"color": ink(), "linestyle": ":", "linewidth": 1.2}
             panel.plot(mission, predicted, marker=".", label="predicted by the plan", **style)
 
-        new, same = ("new path", "same path")
-        if name == "contact_lost":
-            new, same = (f"measured, {text}" for text in (new, same))
+        prefix = "" if predicted is None else "measured, "
+        new = f"{prefix}new path"
+        same = f"{prefix}same path"
         for which, fill, label in ((changed, accent(), new), (~changed, "none", same)):
             dots = {"markerfacecolor": fill, "markeredgecolor": accent(), "label": label}
             panel.plot(mission[which], values[which], "o", markersize=5.5, **dots)
