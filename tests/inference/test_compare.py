@@ -14,7 +14,7 @@ from numpyro.infer import MCMC, NUTS
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import add_latent, compare, fit, loo
-from trustbo.models import ContactRate, PooledTrust, Priors
+from trustbo.models import ContactRate, HierarchicalTrust, PooledTrust, Priors
 
 N_TICKS = 40
 PLAIN = PooledTrust(Priors())  # priors that are given do not depend on the features
@@ -175,3 +175,26 @@ def test_the_table_says_what_is_decided(of_class):
     table = compare(few, models={"wrong": wrong}, progress=False)
     assert "10 missions" in table.loc["wrong", "verdict"]
     az.plot_compare(table)
+
+
+def test_models_of_a_poor_robot_are_told_apart_by_predictions_and_by_loo():
+    z = np.random.default_rng(5).uniform(size=(12, 6, 3, 2))
+    y = np.clip(draw_rates(TRUTH, z, seed=5), 0.0, 1.0) * [1.0, 0.6, 1.0]
+    path = [(0, k) for k in range(7)]
+    missions = [Mission.from_arrays(path, a, b) for a, b in zip(z, y, strict=True)]
+    models = {"pooled": PooledTrust(), "hierarchical": HierarchicalTrust()}
+    fits = {name: fit(missions, model, progress=False) for name, model in models.items()}
+
+    seen = y.mean((0, 1))
+    outside = {}
+    for name, posterior in fits.items():
+        means = posterior["posterior_predictive"]["contact_rate"].mean(("mission", "bound"))
+        low, high = means.quantile([0.05, 0.95], ("chain", "draw")).values
+        outside[name] = (seen < low) | (seen > high)
+    assert outside["pooled"][1]
+    assert not outside["hierarchical"].any()
+
+    assert compare(fits, progress=False)["verdict"].to_dict() == {
+        "hierarchical": "best",
+        "pooled": "worse",
+    }

@@ -100,9 +100,9 @@ def test_bare_ground_hinders_sight_least_and_dense_canopy_most(wooded):
             KinematicSimulator(wooded, sight=Sight(extinction=k)).run(PATH, seed=s).contact_rate
             for s in range(3)
         ])
-        for k in (0.0, 0.1, 1.0)
+        for k in (0.0, 0.1, 1.0, np.inf)
     }  # fmt: skip
-    assert mean[0.0] >= mean[0.1] >= mean[1.0]
+    assert mean[0.0] >= mean[0.1] >= mean[1.0] >= mean[np.inf]
     assert mean[0.0] > mean[1.0] + 0.1
 
 

@@ -59,6 +59,19 @@ def test_a_cell_mostly_without_data_is_impassable_and_named(real_terrain):
 
 
 @pytest.mark.filterwarnings("ignore:the loading of")  # 40 x 30 coarse pixels
+def test_cells_that_miss_more_than_half_of_their_pixels_are_impassable(terrain):
+    holed = terrain.copy(deep=True)
+    for name in ("dem", "dsm"):
+        holed[name][:10, :30] = np.nan  # a third of cell (0, 0)
+        holed[name][60:80, 30:60] = np.nan  # two thirds of cell (2, 1)
+    workspace = Workspace.from_terrain(holed, (4, 3))
+    assert np.argwhere(~workspace.passable.values).tolist() == [[2, 1]]
+
+    kept = np.nanmean(workspace.pixels["visibility"].values[:30, :30])
+    of_cell = workspace.awareness.sel(robot="r1", feature="visibility")[:, 0, 0].mean("move")
+    np.testing.assert_allclose(of_cell, kept)
+
+
 def test_a_dataset_of_one_s_own_is_put_in_order(terrain):
     """Coarsened, cut or flipped datasets keep a stale transform: the coordinates count."""
     coarse = terrain.coarsen(x=3, y=3).mean()
