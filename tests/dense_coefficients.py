@@ -191,9 +191,15 @@ def human_inputs(observations, bounds):
 
 
 def place_inputs(observations, bounds):
-    """Effects of the cells entered and of the directed bounds."""
+    """Effects of the cells entered, of the directed bounds, and of each robot in a bound."""
     columns = [(bounds[..., 1:] == cell).all(-1)[..., None] for cell in cells_of(bounds)]
-    return columns + [(bounds == bound).all(-1)[..., None] for bound in bounds_of(bounds)]
+    columns += [(bounds == bound).all(-1)[..., None] for bound in bounds_of(bounds)]
+    robots = of_each(observations.contact_rate.shape[2])
+    return columns + [
+        (bounds == bound).all(-1)[..., None] * robot
+        for bound in bounds_of(bounds)
+        for robot in robots
+    ]
 
 
 def robot_inputs(observations, bounds):
@@ -291,7 +297,8 @@ def human_prior(model, observations, theta, bounds, gain):
 
 
 def place_prior(effect, observations, theta, bounds, gain):
-    """A Matern 3/2 process over cells, and independent effects of bounds."""
+    """A Matern 3/2 process over cells, effects of bounds, and of robots, which sum to 0."""
+    n_robots = observations.contact_rate.shape[2]
     cells, n_bounds = cells_of(bounds), len(bounds_of(bounds))
     distance = np.linalg.norm(cells[:, None] - cells, axis=2)
     h = np.sqrt(3.0) * distance / theta["length_scale"]
@@ -299,6 +306,8 @@ def place_prior(effect, observations, theta, bounds, gain):
     return [
         (np.zeros(len(cells)), theta["tau_s"] ** 2 * matern),
         (np.zeros(n_bounds), theta["tau_e"] ** 2 * np.eye(n_bounds)),
+        *[(np.zeros(n_robots), theta["tau_r"] ** 2 * (np.eye(n_robots) - 1.0 / n_robots))]
+        * n_bounds,
     ]
 
 

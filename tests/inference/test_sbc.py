@@ -56,7 +56,8 @@ def test_every_parameter_and_the_ends_of_effects_are_ranked():
 
     names = {"beta0", "beta[0]", "b", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e"}
     names |= {"tau_slow", "tau_mission", "robot_effect[0,0]", "robot_effect[2,1]"}
-    assert names | {"place[0]", "place_bound[0]"} < set(ranks)
+    names |= {"tau_r", "place[0]", "place_bound[0]", "place_robot[0,0]"}
+    assert names < set(ranks)
     assert ranks.min().min() >= 0
     assert ranks.max().max() <= 40
 

@@ -387,9 +387,10 @@ def sample_prior_ahead(model: TrustModel, workspace: Workspace, n_draws: int, se
     maps = {}
     if any(isinstance(effect, PlaceEffect) for effect in model.effects):
         nowhere = {name: np.zeros((1, n_draws, 0)) for name in ("place", "place_bound")}
+        nowhere["place_robot"] = np.zeros((1, n_draws, 0, n_robots))
         rows, cols = workspace.passable.shape
         places = visited(np.full((1, 1, 3), -1), (rows, cols))
-        maps = place_maps_of(place_group(nowhere, places, seed), parameters)
+        maps = place_maps_of(place_group(nowhere, places, workspace.team.names, seed), parameters)
 
     never = {"robot_effect": np.zeros((n_draws, 0, n_robots))}
     robots = _robot_effects_ahead(

@@ -409,7 +409,8 @@ def _laid_out(
     dims = in_label_order(groups, density.model.dims)
     tree = to_datatree(groups, missions, dims, density.model.effects)
     if places is not None:
-        tree["places"] = xr.DataTree(place_group(places, density.observations.visited, seed))  # pyright: ignore[reportArgumentType]
+        at: Any = density.observations.visited
+        tree["places"] = xr.DataTree(place_group(places, at, missions[0].robots, seed))
     return tree
 
 

@@ -10,7 +10,7 @@ The random part of the draws is centred at 0. The mean map is therefore the post
 effects, without Monte Carlo error in places that were not visited.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -37,24 +37,30 @@ _BOUND = ("move", "row", "col")
 """Axes of a bound."""
 
 
-def place_group(draws: Mapping[str, np.ndarray], places: Visited, seed: int) -> xr.Dataset:
+def place_group(
+    draws: Mapping[str, np.ndarray], places: Visited, robots: Sequence[str], seed: int
+) -> xr.Dataset:
     """Build the posterior group `places`, with the effects of visited cells and bounds.
 
     Args:
-        draws: Arrays place (chain, draw, cell) and place_bound (chain, draw, bound).
+        draws: Arrays place (chain, draw, cell), place_bound (chain, draw, bound) and place_robot
+            (chain, draw, bound, robot).
         places: Visited places. If some are on other maps than the workspace, the coordinates
             `cell_map` and `bound_map` are the numbers of the maps, 0 for the workspace.
+        robots: Names of the robots.
         seed: Random seed for the maps that `params_of` draws.
     """
     variables = {
         "place": (("chain", "draw", "cell"), draws["place"]),
         "place_bound": (("chain", "draw", "bound"), draws["place_bound"]),
+        "place_robot": (("chain", "draw", "bound", "robot"), draws["place_robot"]),
     }
 
     n_chains, n_draws = draws["place"].shape[:2]
     coords = {
         "chain": np.arange(n_chains),
         "draw": np.arange(n_draws),
+        "robot": list(robots),
         **{f"cell_{name}": ("cell", places.cells[:, i]) for i, name in enumerate(_CELL)},
         **{f"bound_{name}": ("bound", places.bounds[:, i]) for i, name in enumerate(_BOUND)},
     }

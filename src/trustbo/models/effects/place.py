@@ -1,7 +1,8 @@
-"""Place effects: a Gaussian process s over cells, and an effect e of each directed bound."""
+"""Place effects: a process s over cells, and effects e of bounds and r of robots in bounds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,31 +26,46 @@ _LENGTH_SCALES = (1e-6, 1e6)  # limits in cells, at which cells are independent 
 
 @dataclass(frozen=True)
 class PlaceEffect(Effect):
-    """Effect of a place on the trust of all robots, beyond what awareness explains.
+    """Effect of a place on the trust of robots, beyond what awareness explains.
 
-    The bound from cell a to c has the drift u(a -> c) = beta . z(a -> c) + b + s(c) + e(a -> c).
-    Here s is a Gaussian process over cells with standard deviation tau_s and a Matern 3/2
-    covariance. The effects e(a -> c) ~ N(0, tau_e^2) of directed bounds are independent. Missions
-    on another map (see `Mission.map`) have other places, whose effects are independent of those of
-    the workspace, with the same standard deviations and length scale.
+       In the bound from cell a to c, the drift of robot i is
+
+           u_i(a -> c) = beta . z_i(a -> c) + b + s(c) + e(a -> c) + r_i(a -> c).
+
+       Here s is a Gaussian process over cells with standard deviation tau_s and a Matern 3/2
+       covariance. The effects e(a -> c) ~ N(0, tau_e^2) of directed bounds are independent. The
+       effects r_i are those of robots in a bound, which sum to 0 over the robots: they have the
+       covariance tau_r^2 (I - 1/n) over n robots. Awareness is wrong for each robot in its own way,
+       and equally so each time that the bound is driven. Without r_i, a few bounds that are driven
+       again and again would seem to prove wrong weights. Plans and predictions leave out r_i, whose
+       mean over the team is 0.
+    Missions
+       on another map (see `Mission.map`) have other places, whose effects are independent of those of
+       the workspace, with the same standard deviations and length scale.
 
     Attributes:
-        tau_s: Scale of the half-normal prior on the standard deviation of s.
-        tau_e: Scale of the half-normal prior on the standard deviation of e.
-        length_scale: Median of the log-normal prior on the length scale of s, in cells.
-        length_scale_sd: Prior standard deviation of the log length scale.
+           tau_s: Scale of the half-normal prior on the standard deviation of s.
+           tau_e: Scale of the half-normal prior on the standard deviation of e.
+           tau_r: Scale of the half-normal prior on the standard deviation of r.
+           length_scale: Median of the log-normal prior on the length scale of s, in cells.
+           length_scale_sd: Prior standard deviation of the log length scale.
 
     Raises:
-        TrustboError: If a setting is not positive.
+           TrustboError: If a setting is not positive.
     """
 
     tau_s: float = 0.2
     tau_e: float = 0.2
+    tau_r: float = 0.1
     length_scale: float = 2.0
     length_scale_sd: float = 0.5
-    names = ("tau_s", "length_scale", "tau_e")
+    names = ("tau_s", "length_scale", "tau_e", "tau_r")
     group = "places"
-    variables: ClassVar = {"place": (), "place_bound": ()}  # axes are in `place_maps.place_group`
+    variables: ClassVar = {
+        "place": (),
+        "place_bound": (),
+        "place_robot": (),
+    }  # axes are in `place_maps.place_group`
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,7 +91,10 @@ class PlaceEffect(Effect):
         return observations._replace(visited=visited(bounds, shape, maps_of(missions)))
 
     def design(self, observations: Observations) -> Any:
-        """Return indicator columns of the cells entered and of the directed bounds."""
+        """Return indicator columns of the cells entered and of the directed bounds.
+
+        Further columns are contrasts between the robots in each bound; the contrast varies fastest.
+        """
         places: Any = observations.visited
         at = np.broadcast_to(places.at[..., None], observations.contact_rate.shape).ravel()
         row = np.flatnonzero(at >= 0)
@@ -85,7 +104,16 @@ class PlaceEffect(Effect):
         ones = np.ones(len(row))
         of_cells = sparse.csr_array((ones, (row, cell)), shape=(len(at), len(places.cells)))
         of_bounds = sparse.csr_array((ones, (row, bound)), shape=(len(at), len(places.bounds)))
-        return sparse.hstack([of_cells, of_bounds], format="csr")
+
+        contrast = contrasts(observations.n_robots)
+        n_contrasts = contrast.shape[1]
+        robot = row % observations.n_robots
+        columns = bound[:, None] * n_contrasts + np.arange(n_contrasts)
+        of_robots = sparse.csr_array(
+            (contrast[robot].ravel(), (np.repeat(row, n_contrasts), columns.ravel())),
+            shape=(len(at), len(places.bounds) * n_contrasts),
+        )
+        return sparse.hstack([of_cells, of_bounds, of_robots], format="csr")
 
     def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
         """Return a Gaussian-process prior on cells and independent priors on bounds."""
@@ -93,7 +121,13 @@ class PlaceEffect(Effect):
         places: Any = observations.visited
         of_bound = xp.maximum(theta["tau_e"], LEAST) ** -2.0
         of_bounds = xp.repeat(of_bound[:, None], len(places.bounds), axis=1)
-        return None, [*(self._cells(theta, square) for square in places.squares), of_bounds]
+
+        n_contrasts = len(places.bounds) * (observations.n_robots - 1)
+        of_robot = xp.maximum(theta["tau_r"], LEAST) ** -2.0
+        of_robots = xp.repeat(of_robot[:, None], n_contrasts, axis=1)
+
+        of_cells = [self._cells(theta, square) for square in places.squares]
+        return None, [*of_cells, of_bounds, of_robots]
 
     def _cells(self, theta: Theta, square: np.ndarray) -> Any:
         """Compute the precision (point, cell, cell) of s from squared distances (cell, cell)."""
@@ -108,14 +142,19 @@ class PlaceEffect(Effect):
         return inverse(tau**2 * (K + _JITTER * np.eye(len(square))))
 
     def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
-        """Return the effects `place` (draw, cell) and `place_bound` (draw, bound)."""
+        """Return `place` (draw, cell), `place_bound` (draw, bound), `place_robot` (.., robot)."""
         places: Any = observations.visited
-        n = len(places.cells)
-        return {"place": c[:, :n], "place_bound": c[:, n:]}
+        contrast = contrasts(observations.n_robots)
+        n_bounds = len(places.bounds)
+        of_cells, of_bounds, of_robots = np.split(c, np.cumsum([len(places.cells), n_bounds]), 1)
+        of_robots = of_robots.reshape(len(c), n_bounds, contrast.shape[1]) @ contrast.T
+        return {"place": of_cells, "place_bound": of_bounds, "place_robot": of_robots}
 
     def coefficients(self, values: Values, theta: Theta, observations: Observations) -> np.ndarray:
         """See `Effect.coefficients`."""
-        return np.column_stack([values["place"], values["place_bound"]])
+        of_robots = values["place_robot"] @ contrasts(observations.n_robots)
+        of_robots = of_robots.reshape(len(of_robots), -1)
+        return np.column_stack([values["place"], values["place_bound"], of_robots])
 
 
 def _sd_given_neighbour(length_scale: Any) -> Any:
@@ -123,6 +162,17 @@ def _sd_given_neighbour(length_scale: Any) -> Any:
     xp: Any = namespace(length_scale)
     correlation = matern(1.0, xp.clip(length_scale, *_LENGTH_SCALES))
     return xp.sqrt(xp.maximum((1.0 - correlation) * (1.0 + correlation), _JITTER))
+
+
+@lru_cache(8)
+def contrasts(n: int) -> np.ndarray:
+    """Return orthonormal contrasts (robot, contrast) between n robots (Helmert)."""
+    contrast = np.zeros((n, n - 1))
+    for k in range(1, n):
+        contrast[:k, k - 1] = 1.0
+        contrast[k, k - 1] = -k
+        contrast[:, k - 1] /= np.sqrt(k * (k + 1.0))
+    return contrast
 
 
 def matern(distance: ArrayLike, length_scale: ArrayLike) -> Any:
