@@ -19,7 +19,7 @@ from dense_statespace import (
     stacked,
     trust_covariance,
 )
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, helmert
 
 NUGGET = 1e-8
 """Variance added to the correlation of places, as the definition of `PlaceEffect` has it."""
@@ -194,11 +194,11 @@ def place_inputs(observations, bounds):
     """Effects of the cells entered, of the directed bounds, and of each robot in a bound."""
     columns = [(bounds[..., 1:] == cell).all(-1)[..., None] for cell in cells_of(bounds)]
     columns += [(bounds == bound).all(-1)[..., None] for bound in bounds_of(bounds)]
-    robots = of_each(observations.contact_rate.shape[2])
+    contrasts = helmert(observations.contact_rate.shape[2])
     return columns + [
-        (bounds == bound).all(-1)[..., None] * robot
+        (bounds == bound).all(-1)[..., None] * contrast
         for bound in bounds_of(bounds)
-        for robot in robots
+        for contrast in contrasts
     ]
 
 
@@ -298,16 +298,15 @@ def human_prior(model, observations, theta, bounds, gain):
 
 def place_prior(effect, observations, theta, bounds, gain):
     """A Matern 3/2 process over cells, effects of bounds, and of robots, which sum to 0."""
-    n_robots = observations.contact_rate.shape[2]
     cells, n_bounds = cells_of(bounds), len(bounds_of(bounds))
+    n_contrasts = n_bounds * (observations.contact_rate.shape[2] - 1)
     distance = np.linalg.norm(cells[:, None] - cells, axis=2)
     h = np.sqrt(3.0) * distance / theta["length_scale"]
     matern = (1.0 + h) * np.exp(-h) + NUGGET * np.eye(len(cells))
     return [
         (np.zeros(len(cells)), theta["tau_s"] ** 2 * matern),
         (np.zeros(n_bounds), theta["tau_e"] ** 2 * np.eye(n_bounds)),
-        *[(np.zeros(n_robots), theta["tau_r"] ** 2 * (np.eye(n_robots) - 1.0 / n_robots))]
-        * n_bounds,
+        (np.zeros(n_contrasts), theta["tau_r"] ** 2 * np.eye(n_contrasts)),
     ]
 
 

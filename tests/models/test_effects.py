@@ -5,6 +5,7 @@ import pytest
 from missions import walking_missions
 
 from trustbo.data import Mission
+from trustbo.inference.fit import fit
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect
 
 N_MISSIONS = 4
@@ -88,7 +89,7 @@ def test_a_robot_s_effect_in_a_mission_changes_its_own_trust_there(theta, missio
                 np.testing.assert_allclose(drift[:, j, k, i], expected, rtol=1e-10)
 
 
-def test_a_place_changes_the_trust_of_all_robots_on_bounds_into_it(missions):
+def test_a_place_changes_the_trust_of_robots_on_bounds_into_it(missions):
     model = PooledTrust(effects=PlaceEffect())
     observations = model.observations(missions)
     values, drift = drift_of(model.effects[0], observations, THETA)
@@ -102,9 +103,33 @@ def test_a_place_changes_the_trust_of_all_robots_on_bounds_into_it(missions):
             before, cell = mission.path[k], list(mission.path[k + 1])
             move = moves.index((cell[0] - before[0], cell[1] - before[1]))
             expected = values["place"][:, cells.index(cell)]
-            expected = expected + values["place_bound"][:, bounds.index([move, *cell])]
+            bound = bounds.index([move, *cell])
+            expected = expected + values["place_bound"][:, bound]
             for i in range(N_ROBOTS):
-                np.testing.assert_allclose(drift[:, j, k, i], expected, rtol=1e-10)
+                of_robot = expected + values["place_robot"][:, bound, i]
+                np.testing.assert_allclose(drift[:, j, k, i], of_robot, rtol=1e-10)
+    np.testing.assert_allclose(values["place_robot"].sum(2), 0.0, atol=1e-12)
+
+
+def test_bounds_driven_again_do_not_make_weights_certain():
+    """Line of sight is wrong for each robot in each of ten bounds, equally so in six missions."""
+    rng = np.random.default_rng(0)
+    sight = rng.uniform(0.3, 0.9, (10, 3))
+    rates = sight + rng.normal(0.0, 0.08, sight.shape)
+    path = [(0, k) for k in range(11)]
+    missions = []
+    for _ in range(6):
+        measured = np.clip(rates + rng.normal(0.0, 0.01, rates.shape), 0.0, 1.0)
+        features = ["line_of_sight"]
+        missions.append(Mission.from_arrays(path, sight[..., None], measured, features=features))
+
+    spread = {}
+    for tau_r in (1e-4, 0.1):
+        model = PooledTrust(effects=PlaceEffect(tau_r=tau_r))
+        draws = fit(missions, model, progress=False, latent=False)["posterior"]
+        spread[tau_r] = float((draws["beta"] / (1.0 - draws["beta0"])).std())
+
+    assert spread[1e-4] < 0.7 * spread[0.1]
 
 
 def covariance_of_missions(point, n, rho):

@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
 import numpyro.distributions as dist
 from numpy.typing import ArrayLike
 from scipy import sparse
+from scipy.linalg import helmert
 
 from trustbo.data import Mission
 from trustbo.errors import require_positive
@@ -28,30 +28,32 @@ _LENGTH_SCALES = (1e-6, 1e6)  # limits in cells, at which cells are independent 
 class PlaceEffect(Effect):
     """Effect of a place on the trust of robots, beyond what awareness explains.
 
-       In the bound from cell a to c, the drift of robot i is
+    In the bound from cell a to c, the drift of robot i is
 
-           u_i(a -> c) = beta . z_i(a -> c) + b + s(c) + e(a -> c) + r_i(a -> c).
+        u_i(a -> c) = beta . z_i(a -> c) + b + s(c) + e(a -> c) + r_i(a -> c).
 
-       Here s is a Gaussian process over cells with standard deviation tau_s and a Matern 3/2
-       covariance. The effects e(a -> c) ~ N(0, tau_e^2) of directed bounds are independent. The
-       effects r_i are those of robots in a bound, which sum to 0 over the robots: they have the
-       covariance tau_r^2 (I - 1/n) over n robots. Awareness is wrong for each robot in its own way,
-       and equally so each time that the bound is driven. Without r_i, a few bounds that are driven
-       again and again would seem to prove wrong weights. Plans and predictions leave out r_i, whose
-       mean over the team is 0.
-    Missions
-       on another map (see `Mission.map`) have other places, whose effects are independent of those of
-       the workspace, with the same standard deviations and length scale.
+    Here s is a Gaussian process over cells with standard deviation tau_s and a Matern 3/2
+    covariance. The effects e(a -> c) ~ N(0, tau_e^2) of directed bounds are independent. The
+    effects r_i of robots in a bound sum to 0 over the robots: for n robots, they have the
+    covariance tau_r^2 (I - 1/n).
+
+    Awareness is wrong for each robot in its own way, and equally so each time that a bound is
+    driven. Without r_i, these errors would look like independent noise, and bounds that are driven
+    again and again would seem to prove wrong weights. Plans and predictions leave out r_i, whose
+    mean over the team is 0.
+
+    Missions on another map (see `Mission.map`) have other places, whose effects are independent of
+    those of the workspace, with the same standard deviations and length scale.
 
     Attributes:
-           tau_s: Scale of the half-normal prior on the standard deviation of s.
-           tau_e: Scale of the half-normal prior on the standard deviation of e.
-           tau_r: Scale of the half-normal prior on the standard deviation of r.
-           length_scale: Median of the log-normal prior on the length scale of s, in cells.
-           length_scale_sd: Prior standard deviation of the log length scale.
+        tau_s: Scale of the half-normal prior on the standard deviation of s.
+        tau_e: Scale of the half-normal prior on the standard deviation of e.
+        tau_r: Scale of the half-normal prior on the standard deviation of r.
+        length_scale: Median of the log-normal prior on the length scale of s, in cells.
+        length_scale_sd: Prior standard deviation of the log length scale.
 
     Raises:
-           TrustboError: If a setting is not positive.
+        TrustboError: If a setting is not positive.
     """
 
     tau_s: float = 0.2
@@ -61,11 +63,8 @@ class PlaceEffect(Effect):
     length_scale_sd: float = 0.5
     names = ("tau_s", "length_scale", "tau_e", "tau_r")
     group = "places"
-    variables: ClassVar = {
-        "place": (),
-        "place_bound": (),
-        "place_robot": (),
-    }  # axes are in `place_maps.place_group`
+    # The axes are in `place_maps.place_group`.
+    variables: ClassVar = {"place": (), "place_bound": (), "place_robot": ()}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -164,15 +163,9 @@ def _sd_given_neighbour(length_scale: Any) -> Any:
     return xp.sqrt(xp.maximum((1.0 - correlation) * (1.0 + correlation), _JITTER))
 
 
-@lru_cache(8)
 def contrasts(n: int) -> np.ndarray:
-    """Return orthonormal contrasts (robot, contrast) between n robots (Helmert)."""
-    contrast = np.zeros((n, n - 1))
-    for k in range(1, n):
-        contrast[:k, k - 1] = 1.0
-        contrast[k, k - 1] = -k
-        contrast[:, k - 1] /= np.sqrt(k * (k + 1.0))
-    return contrast
+    """Return orthonormal contrasts (robot, contrast) between n robots."""
+    return helmert(n).T
 
 
 def matern(distance: ArrayLike, length_scale: ArrayLike) -> Any:
