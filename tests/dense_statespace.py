@@ -215,5 +215,7 @@ def of_places(params, path):
             effect = effect + params.place[..., row, col]
         if params.place_bound is not None:
             effect = effect + params.place_bound[..., move, row, col]
+        if params.place_robot is not None:
+            effect = effect + params.place_robot.everywhere()[..., move, row, col]
         effects.append(effect)
     return np.stack(effects, axis=-2)

@@ -115,6 +115,8 @@ def test_trust_in_a_robot_at_a_place_is_that_of_the_last_posterior(result, works
     moves = np.flatnonzero(workspace.passable_bounds.values[:, 2, 3])
     drift = z[moves] @ draws.beta[:, 1].T + draws.b[:, 1] + draws.place[:, 0, 2, 3]
     drift = drift + draws.place_bound[:, 0, moves, 2, 3].T
+    own = params_of(result.posterior, workspace, next_mission=True).place_robot
+    drift = drift + own.everywhere()[:, 1, moves, 2, 3].T
     expected = drift.mean(0) / (1.0 - draws.beta0[:, 1])
 
     trust = result.trust("r2", (2, 3))

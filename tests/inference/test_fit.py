@@ -119,6 +119,51 @@ def test_effects_are_in_the_plans_of_the_next_mission():
     assert params.places
 
 
+def test_forecasts_have_the_effects_of_robots_in_bounds_and_plans_those_of_the_team():
+    missions = walking_missions(0, 3)
+    posterior = fit(missions, PooledTrust(effects=PlaceEffect()), latent=False, **QUIET)
+    expected, drawn = params_of(posterior), params_of(posterior, next_mission=True)
+    assert expected.place_robot is None
+    of_robots = drawn.place_robot.everywhere()
+    np.testing.assert_allclose(of_robots.sum(1), 0.0, atol=1e-12)
+
+    places = posterior["places"].to_dataset().stack(one=("chain", "draw"))
+    bounds = [places[f"bound_{name}"].values for name in ("move", "row", "col")]
+    driven = places["place_robot"].transpose("one", "robot", "bound").values
+    np.testing.assert_allclose(of_robots[:, :, *bounds], driven, atol=1e-12)
+
+    # Elsewhere, effects of robots have the standard deviation tau_r, and are independent.
+    undriven = np.ones(of_robots.shape[2:], bool)
+    undriven[*bounds] = False
+    tau_r = posterior["posterior"]["tau_r"].values.ravel()
+    unit = of_robots[:, :, undriven] / tau_r[:, None, None]
+    n_draws, n_robots, n_bounds = unit.shape
+    np.testing.assert_allclose(unit.var(0).mean(), 1.0 - 1.0 / n_robots, rtol=0.02)
+    assert np.abs(unit.mean(0)).max() < 5.0 / np.sqrt(n_draws)
+    correlation = np.corrcoef(unit[:, 0].T) - np.eye(n_bounds)
+    assert np.abs(correlation).max() < 5.5 / np.sqrt(n_draws)
+
+
+def test_effects_of_robots_in_bounds_follow_the_names_of_the_robots():
+    missions = walking_missions(0, 3)
+    posterior = fit(missions, PooledTrust(effects=PlaceEffect()), latent=False, **QUIET)
+    places = posterior["places"].to_dataset()
+    bounds = [places[f"bound_{name}"].values for name in ("move", "row", "col")]
+    z = np.zeros((3, *(int(n) for n in places.attrs["shape"]), 2))
+
+    def of_team(names):
+        workspace = tb.Workspace.from_awareness(z, team=tb.Team(3, names=names))
+        drawn = params_of(posterior, workspace, next_mission=True)
+        return drawn.place_robot.everywhere()[:, :, *bounds]
+
+    names = list(missions[0].robots)
+    ours, turned, others = of_team(names), of_team(names[::-1]), of_team(["x", "y", "z"])
+    np.testing.assert_array_equal(turned, ours[:, ::-1])
+
+    # What was learned of these robots says nothing about robots with other names.
+    assert np.abs(ours.mean(0)).max() > 4.0 * np.abs(others.mean(0)).max()
+
+
 @pytest.mark.parametrize("y", [0.5, 1.0])
 def test_constant_rates_have_a_posterior(missions, y):
     flat = [
@@ -165,7 +210,7 @@ def test_the_prior_mean_is_that_of_prior_draws():
 
 def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
     """Their variances are those of half-normal standard deviations, E tau^2 = scale^2."""
-    effects = (PlaceEffect(0.2, 0.1), RobotEffect(0.3, 0.4))
+    effects = (PlaceEffect(0.2, 0.1, 0.15), RobotEffect(0.3, 0.4))
     z = np.random.default_rng(1).uniform(size=(3, 8, 4, 5, 2))
     workspace = tb.Workspace.from_awareness(z, features=("traversability", "line_of_sight"))
     draws = sample_prior_ahead(PooledTrust(effects=effects), workspace, 6000, 1)
@@ -174,6 +219,8 @@ def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
     assert draws.place_bound.shape == (6000, 1, 8, 4, 5)
     assert draws.place.var(0).mean() == pytest.approx(0.2**2, rel=0.1)
     assert draws.place_bound.var(0).mean() == pytest.approx(0.1**2, rel=0.1)
+    of_robots = draws.place_robot.everywhere()
+    assert of_robots.var(0).mean() == pytest.approx(0.15**2 * 2.0 / 3.0, rel=0.1)
     together = np.mean(draws.place[:, 0, 0, 0] * draws.place[:, 0, 0, 1])
     assert 0.4 * 0.2**2 < together < 0.9 * 0.2**2
 

@@ -100,7 +100,9 @@ def test_likelihoods_are_those_of_a_chain_of_deviations(deviations):
     posterior = tb.fit(deviations, model, draws=50, seed=1, progress=False)
     draws = posterior["posterior"].isel(chain=0, draw=7)
     d = posterior["robots"]["robot_effect"].values[0, 7]
-    params = tb.inference.params_of(posterior)
+    params = tb.inference.params_of(
+        posterior, next_mission=True
+    )  # with effects of robots in bounds
     assert params.memory == "deviation"
     weights = {"beta": np.tile(draws["beta"].values, (3, 1)), "b": np.full(3, float(draws["b"]))}
     of_draw = params.draw(7)._replace(**weights)

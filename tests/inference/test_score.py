@@ -49,7 +49,7 @@ def placed():
     workspace = tb.Workspace.from_awareness(np.zeros((3, *SHAPE, 2)))
     posterior = fit(missions[:-1], PooledTrust(effects=place), workspace=workspace)
     draws = posterior["posterior"].to_dataset()
-    names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e")
+    names = ("beta0", "delta_w", "delta_v", "tau_s", "length_scale", "tau_e", "tau_r")
     theta = {name: draws[name].values.ravel()[::10] for name in names}
     return missions, posterior, *conditioned(missions, theta)
 

@@ -5,14 +5,15 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from missions import walking_missions
 from scipy.special import expit
 from scipy.stats import norm
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.inference import sample_prior
+from trustbo.inference import params_of, sample_prior
 from trustbo.inference.learner import learner_of
-from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, TrustParams
+from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
 from trustbo.planning import Planner, expected_trust, robot_trust
 from trustbo.workspace.moves import MOVE_NAMES, MOVES
 
@@ -140,6 +141,28 @@ def test_effects_of_places_are_part_of_the_trust_at_the_place(workspace):
     small = tb.Workspace.from_awareness(np.full((3, 3, 3, 2), 0.5))
     with pytest.raises(TrustboError, match="cells"):
         Planner(small, (0, 0), (2, 2)).trust(draws)
+
+
+def test_trust_in_a_robot_has_its_own_effect_in_the_bound_and_that_of_the_team_has_not():
+    missions = walking_missions(0, 3)
+    posterior = tb.fit(
+        missions, PooledTrust(effects=PlaceEffect()), progress=False, check=False, latent=False
+    )
+    places = posterior["places"].to_dataset().isel(bound=0)
+    move = MOVE_NAMES[int(places["bound_move"])]
+    cell = int(places["bound_row"]), int(places["bound_col"])
+
+    z = np.full((3, *(int(n) for n in posterior["places"].attrs["shape"]), 2), 0.5)
+    alike = tb.Workspace.from_awareness(z)
+    planner = Planner(alike, (0, 0), (2, 2))
+    trust = planner.trust(posterior, cell=cell, move=move).values
+    own = places["place_robot"].transpose("chain", "draw", "robot").values.reshape(-1, 3)
+    beta0 = posterior["posterior"]["beta0"].values.reshape(-1, 1)
+    team = trust.mean(1, keepdims=True)
+    np.testing.assert_allclose(trust - team, own / (1.0 - beta0), atol=1e-9)
+
+    mean = planner.trust(params_of(posterior, alike), cell=cell, move=move).values
+    np.testing.assert_allclose(mean, np.broadcast_to(team, mean.shape), atol=1e-9)
 
 
 @pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])

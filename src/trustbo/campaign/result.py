@@ -32,6 +32,7 @@ from trustbo.inference.score import Posteriors
 from trustbo.models.backend import VERSIONS
 from trustbo.models.draws import Draws
 from trustbo.planning import InfeasibleError, Plan, Planner
+from trustbo.planning.problem import with_robots_in_bounds
 from trustbo.simulation import Truth
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -180,7 +181,7 @@ class Result(Summary):
 
     @computed
     def forecast(self) -> Draws:
-        """Draws like `belief`, with effects drawn for the next mission, for bands.
+        """Draws like `belief`, with effects of robots in bounds and the next mission, for bands.
 
         Before anything was learned, they are draws of the prior.
         """
@@ -252,8 +253,8 @@ class Result(Summary):
         """Compute how trustworthy a robot is while the lead enters a cell, after all missions.
 
         The draws are those of the last posterior, with the expected effects of robots in the next
-        mission. Before anything was learned, they are drawn from the prior, without the effects of
-        places and robots, which are 0 on average.
+        mission and the effects of robots in bounds. Before anything was learned, they are drawn
+        from the prior, without the effects of places and robots, which are 0 on average.
 
         Args:
             robot: Name of a robot of T2; by default all robots.
@@ -291,7 +292,9 @@ class Result(Summary):
     @property
     def _beliefs(self) -> Draws:
         """Draws of the last posterior, or of the prior before anything was learned."""
-        return self.draw_prior(_N_PRIOR_DRAWS) if self.state.posterior is None else self.belief
+        if self._drawn is None:
+            return self.draw_prior(_N_PRIOR_DRAWS)
+        return with_robots_in_bounds(*self._drawn)
 
     @computed
     def trust_map(self) -> xr.DataArray:

@@ -11,7 +11,7 @@ import xarray as xr
 from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError, require_count, require_kind, require_whole
 from trustbo.inference.density import Density, JointDraws
-from trustbo.inference.place_maps import place_group, place_maps_of
+from trustbo.inference.place_maps import place_group, place_maps_of, robots_in_bounds_of
 from trustbo.inference.variables import draws_of, prior_parameters
 from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
@@ -147,8 +147,10 @@ def _read_params(
     x0 = {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")}
     memory = posterior.attrs.get("memory", "level")
     maps = {}
+    places = None
     if "places" in posterior.children:
-        maps = place_maps_of(posterior["places"].to_dataset(), parameters)
+        places = posterior["places"].to_dataset()
+        maps = place_maps_of(places, parameters)
 
     found = []
     for is_drawn in next_mission:
@@ -164,7 +166,12 @@ def _read_params(
         )
         ahead = parameters | robots
         params = assemble_params(ahead, x0, memory)
-        found.append(params._replace(**maps))  # pyright: ignore
+        params = params._replace(**maps)  # pyright: ignore
+        if is_drawn and places is not None:
+            names = places["robot"].values.tolist() if workspace is None else workspace.team.names
+            own = robots_in_bounds_of(places, parameters, names)
+            params = params._replace(place_robot=own)
+        found.append(params)
     return found
 
 
@@ -384,13 +391,19 @@ def sample_prior_ahead(model: TrustModel, workspace: Workspace, n_draws: int, se
     drawn = model.scores(prior.observations).draw(n_draws, rng)
     parameters |= {name: drawn[name] for effect in model.effects for name in effect.names}
 
-    maps = {}
+    maps: dict[str, Any] = {}
     if any(isinstance(effect, PlaceEffect) for effect in model.effects):
-        nowhere = {name: np.zeros((1, n_draws, 0)) for name in ("place", "place_bound")}
-        nowhere["place_robot"] = np.zeros((1, n_draws, 0, n_robots))
+        nowhere = {
+            "place": np.zeros((1, n_draws, 0)),
+            "place_bound": np.zeros((1, n_draws, 0)),
+            "place_robot": np.zeros((1, n_draws, 0, n_robots)),
+        }
         rows, cols = workspace.passable.shape
         places = visited(np.full((1, 1, 3), -1), (rows, cols))
-        maps = place_maps_of(place_group(nowhere, places, workspace.team.names, seed), parameters)
+        robots = workspace.team.names
+        group = place_group(nowhere, places, robots, seed)
+        maps = place_maps_of(group, parameters)
+        maps["place_robot"] = robots_in_bounds_of(group, parameters, robots)
 
     never = {"robot_effect": np.zeros((n_draws, 0, n_robots))}
     robots = _robot_effects_ahead(

@@ -375,8 +375,9 @@ def params_of(
         posterior: DataTree from `fit`.
         workspace: Workspace for planning; features and robots are reordered to match the workspace.
         next_mission: Whether to draw the robot effects of the next mission, including their
-            persistent part, for bands and predictions. By default, expected effects are used, as
-            planning needs.
+            persistent part, and to include the effects of robots in bounds, for bands and
+            predictions. By default, expected effects are used, as planning needs: those of robots
+            in bounds are 0 on average over the team.
         model: Model of the posterior; needed only for a NumPyro function that was not used before
             in this process.
 

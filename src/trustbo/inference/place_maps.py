@@ -18,6 +18,7 @@ from scipy import fft
 from scipy.linalg import cho_factor, cho_solve
 
 from trustbo.models.effects.place import matern
+from trustbo.models.robots_in_bounds import RobotsInBounds
 from trustbo.models.visited import Visited
 from trustbo.workspace.moves import MOVE_NAMES
 
@@ -71,7 +72,7 @@ def place_group(
 
 
 def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Draw the effects of all cells and bounds, given the effects at visited places.
+    """Draw the effects of all cells and bounds on the team, given the effects at visited places.
 
     Args:
         group: Posterior group `places`.
@@ -79,7 +80,8 @@ def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> di
 
     Returns:
         Arrays place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The
-        axis `effect` has length 1 because effects are common to all robots.
+        axis `effect` has length 1: effects of robots in bounds, which are 0 on average over the
+        team, are those of `robots_in_bounds_of`.
     """
     group = of_workspace(group)
     rows, cols = (int(n) for n in group.attrs["shape"])
@@ -94,9 +96,35 @@ def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> di
     place_bound = rng.standard_normal((len(place), len(MOVE_NAMES), rows, cols))
     place_bound *= parameters["tau_e"][:, None, None, None]
     _centre(place_bound)
-    visited = tuple(group[f"bound_{name}"].values for name in _BOUND)
-    place_bound[:, *visited] = _by_draw(group, "place_bound", "bound")
+    place_bound[:, *_bounds(group)] = _by_draw(group, "place_bound", "bound")
     return {"place": place[:, None], "place_bound": place_bound[:, None]}
+
+
+def robots_in_bounds_of(
+    group: xr.Dataset, parameters: Mapping[str, np.ndarray], robots: Sequence[str]
+) -> RobotsInBounds:
+    """Return the effects of robots in all bounds, given the effects in visited bounds.
+
+    Args:
+        group: Posterior group `places`.
+        parameters: Hyperparameters (draw,) by name, with chains joined.
+        robots: Names of the robots of the result. Nothing is known of a team with other robots.
+    """
+    group = of_workspace(group)
+    rows, cols = (int(n) for n in group.attrs["shape"])
+    tau_r = parameters["tau_r"]
+
+    column = np.full((len(MOVE_NAMES), rows, cols), -1)
+    known = np.zeros((len(tau_r), len(robots), 0))
+    if set(robots) <= set(group["robot"].values.tolist()):
+        n_bounds = group.sizes["bound"]
+        column[*_bounds(group)] = np.arange(n_bounds)
+        known = group["place_robot"].sel(robot=list(robots))
+        known = known.transpose("chain", "draw", "robot", "bound").values
+        known = known.reshape(len(tau_r), len(robots), n_bounds)
+
+    seed = int(group.attrs["seed"])
+    return RobotsInBounds(known, column, tau_r, np.arange(len(tau_r)), seed)
 
 
 def of_workspace(group: xr.Dataset) -> xr.Dataset:
@@ -104,6 +132,11 @@ def of_workspace(group: xr.Dataset) -> xr.Dataset:
     if "cell_map" not in group.coords:
         return group
     return group.isel(cell=group["cell_map"].values == 0, bound=group["bound_map"].values == 0)
+
+
+def _bounds(group: xr.Dataset) -> tuple[np.ndarray, ...]:
+    """Return the moves, rows and columns of the visited bounds."""
+    return tuple(group[f"bound_{name}"].values for name in _BOUND)
 
 
 def _by_draw(group: xr.Dataset, name: str, axis: str) -> np.ndarray:

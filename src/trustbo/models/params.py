@@ -9,6 +9,7 @@ from trustbo.arrays import require_numbers
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.models.draws import Draws
+from trustbo.models.robots_in_bounds import RobotsInBounds
 from trustbo.statespace import StateSpace
 from trustbo.statespace.form import coupled_robots, independent_robots
 
@@ -34,6 +35,7 @@ class ParameterDraws(Summary, Draws):
     """Subscripts of the `np.einsum` call that sums weights times awareness."""
     BY_ROBOT: ClassVar[bool] = False
     """Whether coefficients differ between robots, so that b has the axis (robot,)."""
+    place_robot: RobotsInBounds | None
     _fields: ClassVar[tuple[str, ...]]
 
     def _rows(self) -> Rows:
@@ -46,7 +48,8 @@ class ParameterDraws(Summary, Draws):
     @property
     def by_name(self) -> dict[str, Numbers]:
         """Arrays by name, without fields that are None."""
-        values = {name: getattr(self, name) for name in self._fields if name != "memory"}
+        names = [name for name in self._fields if name not in ("memory", "place_robot")]
+        values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value is not None}
 
     @property
@@ -154,6 +157,8 @@ class ParameterDraws(Summary, Draws):
                 effect = effect[..., None, :, :]
             u = u + effect
 
+        if self.place_robot is not None:
+            u = u + self.place_robot.everywhere()
         return u
 
     def team_inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
@@ -178,7 +183,7 @@ class ParameterDraws(Summary, Draws):
         return {name: np.asarray(v) for name, v in self.by_name.items() if name in PLACES}
 
     def of_places(self, bounds: np.ndarray) -> np.ndarray:
-        """Return the sum (..., effect, bound) of the effects of each bound and of the entered cell.
+        """Return the sum (..., effect, bound) of the effects of the entered cell and each bound.
 
         `bounds` (bound, 3) contains moves, rows and columns; effects of move -1 are 0.
         """
@@ -189,19 +194,29 @@ class ParameterDraws(Summary, Draws):
         if "place_bound" in self.places:
             total = total + self.places["place_bound"][..., moves, rows, cols]
 
-        return np.where(moves < 0, 0.0, total)
+        total = np.where(moves < 0, 0.0, total)
+        return total if self.place_robot is None else total + self.place_robot.at(bounds)
 
     def draw(self, index: int | np.ndarray) -> Self:
         """Select draws by index; a single index also drops the leading axis."""
-        return self.map(lambda value, n: np.asarray(value)[index] if np.ndim(value) > n else value)
+        drawn = self.map(lambda value, n: np.asarray(value)[index] if np.ndim(value) > n else value)
+        return drawn._with_robots(lambda robots: robots.draw(index))
 
     def mean(self) -> Self:
         """Average over all leading axes."""
-        return self.flat().map(lambda value, _: value.mean(0))
+        mean = self.flat().map(lambda value, _: value.mean(0))
+        return mean._with_robots(RobotsInBounds.mean)
 
     def flat(self) -> Self:
         """Return every field in float64 with exactly one leading axis (draw,)."""
-        return self._replace(**self._joined(list(self.by_name)))  # pyright: ignore[reportAttributeAccessIssue]
+        flat: Self = self._replace(**self._joined(list(self.by_name)))  # pyright: ignore[reportAttributeAccessIssue]
+        return flat._with_robots(RobotsInBounds.flat)
+
+    def _with_robots(self, change: Callable[[RobotsInBounds], RobotsInBounds]) -> Self:
+        """Return the parameters after a change of the effects of robots in bounds, if any."""
+        if self.place_robot is None:
+            return self
+        return self._replace(place_robot=change(self.place_robot))  # pyright: ignore[reportAttributeAccessIssue]
 
     def record(self) -> dict[str, Any]:
         """See `Draws.record`."""
@@ -228,6 +243,7 @@ class _Trust(NamedTuple):
     place_bound: Numbers | None = None
     memory: str = "level"
     delta_s: Numbers | None = None
+    place_robot: RobotsInBounds | None = None
 
 
 class TrustParams(ParameterDraws, _Trust):
@@ -247,6 +263,7 @@ class TrustParams(ParameterDraws, _Trust):
             ordered as in `workspace.MOVES`.
         memory: Quantity carried over between bounds, `"level"` or `"deviation"`; see `PooledTrust`.
         delta_s: Standard deviation of the noise that all robots share, shape (...,), or None.
+        place_robot: Effects of robots in bounds, in forecasts of the default model, or None.
     """
 
     __slots__ = ()
@@ -284,14 +301,15 @@ class _Coupled(NamedTuple):
     x0_sd: Numbers = 0.5
     place: Numbers | None = None
     place_bound: Numbers | None = None
+    place_robot: RobotsInBounds | None = None
 
 
 class CoupledParams(ParameterDraws, _Coupled):
     """Parameters of the coupled model, equations (1)-(2).
 
     The fields are B0 (..., robot, robot'), B (..., feature, robot, robot'), b (..., robot), and the
-    covariances Delta_w and Delta_v (..., robot, robot'). The fields x0_mean, x0_sd, place and
-    place_bound are the same as in `TrustParams`.
+    covariances Delta_w and Delta_v (..., robot, robot'). The fields x0_mean, x0_sd, place,
+    place_bound and place_robot are the same as in `TrustParams`.
     """
 
     __slots__ = ()
@@ -327,7 +345,7 @@ _MOST_SHOWN = 6  # numbers of a field that a summary shows; of longer fields, it
 
 
 def assemble_params(
-    parameters: Mapping[str, np.ndarray], x0: Mapping[str, float], memory: str = "level"
+    parameters: Mapping[str, np.ndarray], x0: Mapping[str, Any], memory: str = "level"
 ) -> Params:
     """Build parameters from variables (draw, ...) by name, and from x0_mean and x0_sd.
 

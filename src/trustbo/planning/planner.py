@@ -39,6 +39,7 @@ from trustbo.planning.problem import (
     mean_and_draws_of,
     mean_of,
     risk_of,
+    robot_draws_of,
 )
 from trustbo.planning.recursion import Recursion, states_along, trust_recursion
 from trustbo.planning.robot_trust import robot_maps, robot_trust
@@ -498,7 +499,7 @@ class Planner(Summary):
         Example:
             >>> planner.trust(posterior, "r2", (3, 4)).quantile([0.05, 0.5, 0.95])
         """
-        draws = draws_of(params, self.workspace)
+        draws = robot_draws_of(params, self.workspace)
         family = self.problem.likelihood
         return robot_trust(self.workspace, family, draws, robot, cell, move=move, as_rate=as_rate)
 
@@ -516,7 +517,7 @@ class Planner(Summary):
             `trust_mean` and standard deviation `trust_sd` of `trust`, and the mean `contact_rate`
             of `trust(as_rate=True)`. Cells that no bound enters are NaN.
         """
-        draws = draws_of(posterior, self.workspace)
+        draws = robot_draws_of(posterior, self.workspace)
         return robot_maps(self.workspace, self.problem.likelihood, draws)
 
     @computing()

@@ -17,6 +17,7 @@ from trustbo.hazard.risk import ROUNDING, Risk
 from trustbo.inference.learner import expected_and_drawn, params_of
 from trustbo.models.draws import Draws
 from trustbo.models.families import Family
+from trustbo.models.params import ParameterDraws
 from trustbo.planning.labels import LOGISTIC, LOSSES, TINY_SD, Costs, best_labels
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
 from trustbo.planning.paths import AdmissiblePaths
@@ -369,6 +370,21 @@ def _require_draws(given: object) -> Draws:
     draws: Draws = require_kind("posterior", given, Draws, remedy)
     draws.require_valid()
     return draws.flat() if len(draws.leading) > 1 else draws
+
+
+def robot_draws_of(posterior: Draws | xr.DataTree, workspace: Workspace) -> Draws:
+    """Return `draws_of`, but with the effects of robots in bounds, which plans leave out."""
+    if isinstance(posterior, xr.DataTree):
+        return with_robots_in_bounds(*expected_and_drawn(posterior, workspace))
+    return _require_draws(posterior)
+
+
+def with_robots_in_bounds(expected: Draws, drawn: Draws) -> Draws:
+    """Return draws with expected effects of missions, and with the effects in bounds of `drawn`."""
+    own = drawn.place_robot if isinstance(drawn, ParameterDraws) else None
+    if own is None:
+        return expected
+    return cast(ParameterDraws, expected)._replace(place_robot=own)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def mean_of(params: Draws | xr.DataTree, workspace: Workspace) -> Draws:

@@ -39,8 +39,8 @@ class PlaceEffect(Effect):
 
     Awareness is wrong for each robot in its own way, and equally so each time that a bound is
     driven. Without r_i, these errors would look like independent noise, and bounds that are driven
-    again and again would seem to prove wrong weights. Plans and predictions leave out r_i, whose
-    mean over the team is 0.
+    again and again would seem to prove wrong weights. Plans leave out r_i, whose mean over the team
+    is 0; forecasts and the trust in single robots include it.
 
     Missions on another map (see `Mission.map`) have other places, whose effects are independent of
     those of the workspace, with the same standard deviations and length scale.

@@ -1,0 +1,98 @@
+"""Effects of robots in bounds, drawn where they are needed."""
+
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from scipy.special import ndtri
+
+_STEP = np.uint64(0x9E3779B97F4A7C15)
+_MIX = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
+_ONE = 2.0**-53  # distance of the uniform numbers
+
+
+class RobotsInBounds(NamedTuple):
+    """Effects r of robots in the directed bounds of a map, which sum to 0 over robots.
+
+    In visited bounds, they are posterior draws. In all others, they are independent draws of the
+    prior, tau_r (n_i - mean n) with standard normal n_i for robot i. An array of the draws in all
+    bounds would be larger than the other parameters together, by the number of robots. Therefore,
+    n_i is computed from the numbers of the draw, the robot and the bound, when it is needed.
+
+    Attributes:
+        known: Effects in visited bounds, shape (..., robot, visited).
+        column: Index of the visited bound in `known`, shape (move, row, col); -1 elsewhere.
+        tau_r: Standard deviation, shape (...,).
+        number: Number of the draw, shape (...,).
+        seed: Random seed.
+    """
+
+    known: np.ndarray
+    column: np.ndarray
+    tau_r: np.ndarray
+    number: np.ndarray
+    seed: int
+
+    def at(self, bounds: np.ndarray) -> np.ndarray:
+        """Return the effects (..., robot, bound) in some bounds; those of move -1 are 0.
+
+        Args:
+            bounds: Moves, rows and columns, shape (bound, 3).
+        """
+        which = tuple(np.asarray(bounds).T)
+        column = self.column[which]
+        bound = np.asarray(np.ravel_multi_index(which, self.column.shape, mode="wrap"))
+        effects = self._elsewhere(bound)
+
+        is_known = column >= 0
+        effects[..., is_known] = self.known[..., column[is_known]]
+        return np.where(which[0] < 0, 0.0, effects)
+
+    def _elsewhere(self, bound: np.ndarray) -> np.ndarray:
+        """Draw the effects (..., robot, bound) in bounds that were not visited."""
+        n_robots = self.known.shape[-2]
+        robot = np.arange(n_robots)[:, None] * self.column.size
+        draw = self.number[..., None, None] * n_robots * self.column.size
+        n = _standard_normal(draw + robot + bound, self.seed)
+        return self.tau_r[..., None, None] * (n - n.mean(-2, keepdims=True))
+
+    def everywhere(self) -> np.ndarray:
+        """Return the effects (..., robot, move, row, col) in all bounds."""
+        bounds = np.indices(self.column.shape).reshape(3, -1).T
+        effects = self.at(bounds)
+        return effects.reshape(*effects.shape[:-1], *self.column.shape)
+
+    def draw(self, index: Any) -> Self:
+        """Select draws by index."""
+        if not self.number.ndim:
+            return self
+        return self._replace(
+            known=self.known[index],
+            tau_r=np.asarray(self.tau_r[index]),
+            number=np.asarray(self.number[index]),
+        )
+
+    def flat(self) -> Self:
+        """Return the effects with exactly one leading axis (draw,)."""
+        return self._replace(
+            known=self.known.reshape(self.number.size, *self.known.shape[-2:]),
+            tau_r=self.tau_r.ravel(),
+            number=self.number.ravel(),
+        )
+
+    def mean(self) -> Self:
+        """Average over all draws; effects are 0 in bounds that were not visited."""
+        known = self.flat().known.mean(0)
+        return self._replace(known=known, tau_r=np.zeros(()), number=np.zeros((), int))
+
+
+def _standard_normal(counter: np.ndarray, seed: int) -> np.ndarray:
+    """Compute standard normal numbers from whole numbers.
+
+    Number i of the generator SplitMix64 (Steele, Lea and Flood 2014) is a function of i alone.
+    """
+    [first] = np.random.SeedSequence(seed).generate_state(1, np.uint64)
+    z = first + _STEP * counter.astype(np.uint64)
+    z = (z ^ (z >> np.uint64(30))) * _MIX[0]
+    z = (z ^ (z >> np.uint64(27))) * _MIX[1]
+    z = z ^ (z >> np.uint64(31))
+    return ndtri(((z >> np.uint64(11)) + 0.5) * _ONE)
