@@ -101,14 +101,19 @@ def test_effects_of_cells_given_missions_on_other_maps_are_those_of_the_joint_no
     np.testing.assert_allclose(drawn.std(0)[some], sd[some], rtol=5.0 / np.sqrt(8000))
 
 
-def test_slopes_with_places_on_other_maps_in_jax_are_those_in_numpy():
-    posterior, *_ = posterior_on_maps(f"pooled, {EVERYTHING}")
+def require_equal_slopes(posterior):
+    """Compare slopes by JAX at random scores with differences by NumPy."""
     z = 0.5 * np.random.default_rng(3).standard_normal(posterior.n_scores)
     steps = 1e-4 * np.eye(len(z))
     expected = (posterior.log_density(z + steps) - posterior.log_density(z - steps)) / 2e-4
     with own_settings():
         found = jax.grad(lambda one: posterior.log_density(one[None])[0])(jax.numpy.asarray(z))
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_slopes_with_places_on_other_maps_in_jax_are_those_in_numpy():
+    posterior, *_ = posterior_on_maps(f"pooled, {EVERYTHING}")
+    require_equal_slopes(posterior)
 
 
 def test_first_missions_keep_their_maps():
@@ -157,12 +162,7 @@ def test_effects_split_into_chains_have_the_same_draws(name):
 @pytest.mark.usefixtures("chained")
 def test_slopes_of_chains_in_jax_are_those_in_numpy():
     posterior, *_ = posterior_of(GAUSSIAN[f"pooled, {EVERYTHING}"], gaps=True)
-    z = 0.5 * np.random.default_rng(3).standard_normal(posterior.n_scores)
-    steps = 1e-4 * np.eye(len(z))
-    expected = (posterior.log_density(z + steps) - posterior.log_density(z - steps)) / 2e-4
-    with own_settings():
-        found = jax.grad(lambda one: posterior.log_density(one[None])[0])(jax.numpy.asarray(z))
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    require_equal_slopes(posterior)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 3), (3, 4, 1)])
@@ -313,9 +313,4 @@ def test_jax_and_numpy_give_one_evidence(name):
 )
 def test_slopes_in_jax_are_those_of_the_density_in_numpy(name):
     posterior, *_ = posterior_of(GAUSSIAN[name], gaps=True)
-    z = 0.5 * np.random.default_rng(3).standard_normal(posterior.n_scores)
-    steps = 1e-4 * np.eye(len(z))
-    expected = (posterior.log_density(z + steps) - posterior.log_density(z - steps)) / 2e-4
-    with own_settings():
-        found = jax.grad(lambda one: posterior.log_density(one[None])[0])(jax.numpy.asarray(z))
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)
+    require_equal_slopes(posterior)
