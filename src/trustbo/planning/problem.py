@@ -206,9 +206,8 @@ class Problem:
                 f"{MOVE_NAMES[move]!r}; give a probability for every possible bound."
             )
 
-        of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
         limit = np.inf if self.max_failure is None else self.max_failure + ROUNDING
-        return Risks(np.ascontiguousarray(of_bounds), self.price, weights, limit)
+        return Risks(risks_by_bound(p_fail), self.price, weights, limit)
 
     @property
     def _components(self) -> Components:
@@ -277,7 +276,7 @@ class Problem:
         """
         graph = self.paths.graph
         p_fail, weights = self._components
-        of_bounds = risk_of(p_fail).reshape(len(p_fail), -1).T
+        of_bounds = risks_by_bound(p_fail)
         n_bounds, n = len(of_bounds), graph.longest + 1
 
         # No bound costs anything, and a failure costs 1.
@@ -290,7 +289,7 @@ class Problem:
             x0=np.zeros((1, 0)),
             sd=np.ones(1),
             bound_cost=np.zeros(n_bounds),
-            risk=np.ascontiguousarray(of_bounds),
+            risk=of_bounds,
             failure=weights,
             share=weights,
             limit=np.inf,
@@ -348,6 +347,11 @@ def risk_of(p_fail: np.ndarray) -> np.ndarray:
     """Compute the risk -log(1 - p_fail), which is at most 700, and 0 where there is no bound."""
     with np.errstate(divide="ignore"):
         return np.minimum(-np.log1p(-np.nan_to_num(p_fail)), _CERTAIN)
+
+
+def risks_by_bound(p_fail: np.ndarray) -> np.ndarray:
+    """Compute the risks (bound, component) of failure probabilities (component, move, row, col)."""
+    return np.ascontiguousarray(risk_of(p_fail).reshape(len(p_fail), -1).T)
 
 
 def draws_of(
