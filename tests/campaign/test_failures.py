@@ -214,7 +214,8 @@ def test_limit_holds_without_a_price_and_warns_if_no_path_keeps_it(workspace, hi
 def test_the_safest_path_is_planned_if_all_are_likely_to_fail(workspace):
     """Above 90 %, a failure costs the same on every path, so contact would decide."""
     planner = begin(workspace).planner
-    mean = begin(workspace).belief.mean()
+    draws = begin(workspace).belief
+    mean = draws.mean()
     around = ((3, 0), (3, 1), (3, 2), (2, 3), (1, 3), (0, 3))
     p_fail = np.full((8, 4, 4), 0.95)
     p_fail[*bounds_along(around).T] = 0.6
@@ -224,10 +225,10 @@ def test_the_safest_path_is_planned_if_all_are_likely_to_fail(workspace):
 
     assert many.plan(mean).path != around
     assert many.problem.safest() == (around, pytest.approx(1.0 - 0.4**5))
-    assert instead_of_failure(many, many.plan(mean), mean).path == around
+    assert instead_of_failure(many, many.plan(mean), draws).path == around
     for other in (few, free):
         plan = other.plan(mean)
-        assert instead_of_failure(other, plan, mean) is plan
+        assert instead_of_failure(other, plan, draws) is plan
 
 
 def test_a_plan_that_almost_certainly_fails_is_replaced_with_a_warning(steep):

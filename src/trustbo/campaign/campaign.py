@@ -336,11 +336,10 @@ class Campaign(Result):
     ) -> Plan:
         """Plan a path with the policy, and check what it returned."""
         name = f"policy {self.state.settings['policy']!r}"
-        mean = draws.mean()
         try:
             plan = choose_plan(self.policy, rng, draws, planner, driven)
         except InfeasibleError as error:  # `_record` issues the warning
-            return planner.evaluate(error.path, mean)
+            return planner.evaluate(error.path, draws.mean())
 
         require_kind(name, plan, Plan, "a policy must return a trustbo.planning.Plan")
         try:
@@ -348,7 +347,7 @@ class Campaign(Result):
         except TrustboError as error:
             raise TrustboError(f"{name}: {error}") from None
 
-        safest = instead_of_failure(planner, plan, mean)
+        safest = instead_of_failure(planner, plan, draws)
         if safest.path != plan.path:
             warn(
                 f"the path {path_text(plan.path)} almost certainly fails; the safest path is "

@@ -185,7 +185,7 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     return planner.with_risk(risk.mean, risk.draw(_N_RISKS), components)
 
 
-def instead_of_failure(planner: Planner, plan: Plan, mean: Draws) -> Plan:
+def instead_of_failure(planner: Planner, plan: Plan, draws: Draws) -> Plan:
     """Return the plan, or the safest one if the plan almost certainly fails.
 
     If all paths are likely to fail, their costs of failure are nearly equal, so that the plan would
@@ -194,7 +194,7 @@ def instead_of_failure(planner: Planner, plan: Plan, mean: Draws) -> Plan:
     Args:
         planner: Planner of `informed_planner`.
         plan: Plan of a policy.
-        mean: Parameters for which the safest path is evaluated.
+        draws: Parameter draws, under whose mean the safest path is evaluated.
     """
     problem = planner.problem
     if problem.risk is None or not problem.price:
@@ -203,4 +203,4 @@ def instead_of_failure(planner: Planner, plan: Plan, mean: Draws) -> Plan:
         return plan
 
     path, _ = problem.safest()
-    return planner.evaluate(path, mean)
+    return planner.evaluate(path, draws.mean())

@@ -229,7 +229,7 @@ class Result(Summary):
             plan = self.planner.plan(mean)
         except InfeasibleError as error:
             return self.planner.evaluate(error.path, mean)
-        return instead_of_failure(self.planner, plan, mean)
+        return instead_of_failure(self.planner, plan, self.belief)
 
     @computed
     def plan(self) -> Plan:
