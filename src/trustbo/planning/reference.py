@@ -26,7 +26,7 @@ from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.problem import InfeasibleError, Problem, mean_and_draws_of
 from trustbo.planning.recursion import Recursion, states_along
-from trustbo.workspace.moves import MOVES
+from trustbo.workspace.moves import cells_ahead
 
 
 def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
@@ -149,10 +149,7 @@ def _infeasible(problem: Problem, risk: Risk) -> InfeasibleError:
 
 def every_path(paths: AdmissiblePaths) -> Iterator[tuple[Cell, ...]]:
     """Enumerate all admissible paths, which is feasible only for small grids."""
-    onward: dict[Cell, list[Cell]] = {}
-    for move, row, col in np.argwhere(paths.bounds).tolist():
-        down, right = MOVES[move]
-        onward.setdefault((row - down, col - right), []).append((row, col))
+    onward = cells_ahead(paths.bounds)
 
     stack: list[tuple[Cell, ...]] = [(paths.start,)]
     while stack:

@@ -15,7 +15,7 @@ from trustbo.simulation.kinematic import KinematicSimulator
 from trustbo.simulation.protocol import DescribedSimulator, digest
 from trustbo.simulation.world import World
 from trustbo.terrain import CompositeIndex
-from trustbo.workspace.moves import MOVES
+from trustbo.workspace.moves import cells_ahead
 from trustbo.workspace.sight import detection_between, optics
 
 SIGNS = {
@@ -182,10 +182,7 @@ def _random_missions(simulator: KinematicSimulator, seed: int) -> list[Mission]:
     bounds = simulator.workspace.passable_bounds.values
     n_needed = -(-MIN_SAMPLES // simulator.team.n_robots)
 
-    onward: dict[Cell, list[Cell]] = {}
-    for move, row, col in np.argwhere(bounds).tolist():
-        down, right = MOVES[move]
-        onward.setdefault((row - down, col - right), []).append((row, col))
+    onward = cells_ahead(bounds)
     starts = sorted(onward)
 
     missions = []

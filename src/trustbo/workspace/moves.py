@@ -71,3 +71,12 @@ def along(maps: np.ndarray, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
     """
     moves, rows, cols = bounds_along(path).T
     return maps[..., moves, rows, cols, :]
+
+
+def cells_ahead(bounds: np.ndarray) -> dict[Cell, list[Cell]]:
+    """Return the cells to which bounds (move, row, col) lead, by the cell that they leave."""
+    ahead: dict[Cell, list[Cell]] = {}
+    for move, row, col in np.argwhere(bounds).tolist():
+        down, right = MOVES[move]
+        ahead.setdefault((row - down, col - right), []).append((row, col))
+    return ahead
