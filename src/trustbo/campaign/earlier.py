@@ -19,7 +19,7 @@ from trustbo.errors import TrustboError, require_list
 from trustbo.files import to_json
 from trustbo.hazard.trials import LostMission
 from trustbo.logs.netcdf import missions_from_tree, missions_to_tree
-from trustbo.stacking import names_of_all
+from trustbo.stacking import names_of_all, pooled
 from trustbo.workspace import Workspace
 from trustbo.workspace.identity import map_name
 
@@ -65,27 +65,21 @@ def earlier_missions(
         if there == here:
             lost += found.lost
 
-    robots = names_of_all(workspace.team.names, missions)
-    return EarlierMissions(tuple(m.with_robots(robots) for m in missions), tuple(lost))
+    return EarlierMissions(tuple(pooled(workspace.team.names, missions)), tuple(lost))
 
 
 def _missions_of(result: "Result") -> EarlierMissions:
     """Return the missions of a result that can be learned from, its own earlier ones first."""
     state = result.state
-    missions = list(state.earlier.missions)
-    lost = list(state.earlier.lost)
-    for entry in state.entries:
-        if not is_excluded_by_user(entry):
-            missions.append(entry.mission)
-    lost += [LostMission(failure.path, failure.where) for failure in state.failures if failure.path]
-    return EarlierMissions(tuple(missions), tuple(lost))
+    own = [entry.mission for entry in state.entries if not is_excluded_by_user(entry)]
+    return EarlierMissions((*state.earlier.missions, *own), tuple(state.lost))
 
 
 def _require_alike(
     what: str, result: "Result", missions: Sequence[Mission], workspace: Workspace
 ) -> None:
     """Raise TrustboError unless missions of a result can be fitted with those in a workspace."""
-    if not any(not why_never_learned(mission) for mission in missions):
+    if all(why_never_learned(mission) for mission in missions):
         raise TrustboError(f"{what} has no mission to learn from; leave it out.")
 
     own = result.workspace.features

@@ -11,7 +11,6 @@ from trustbo.errors import PosteriorError, TrustboError, warn
 from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
-from trustbo.hazard.trials import LostMission
 from trustbo.inference.learner import Learner
 from trustbo.models.draws import Draws
 from trustbo.planning import Plan, Planner
@@ -148,11 +147,9 @@ def learn_hazard(state: State, workspace: Workspace, so_far: Mission | None = No
     measured += [entry.measured for entry in state.entries if not is_excluded_by_user(entry)]
     if so_far is not None:
         measured.append(so_far)
-    lost = list(state.earlier.lost)
-    lost += [LostMission(f.path, f.where) for f in state.failures if f.path]
     prior = Hazard(**state.settings["hazard"])
     try:
-        return fit_hazard(measured, workspace, prior, lost=lost, seed=state.seed_of("hazard"))
+        return fit_hazard(measured, workspace, prior, lost=state.lost, seed=state.seed_of("hazard"))
     except PosteriorError as error:
         warn(f"{error} The campaign uses the previous hazard posterior.")
 

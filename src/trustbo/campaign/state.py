@@ -170,6 +170,14 @@ class State:
         """Posterior of the parameters after the last mission; None if nothing was learned."""
         return None if self.last is None else self.last()
 
+    @property
+    def lost(self) -> list[LostMission]:
+        """Missions without measurements in which a bound failed, earlier campaigns' first."""
+        own = [
+            LostMission(failure.path, failure.where) for failure in self.failures if failure.path
+        ]
+        return [*self.earlier.lost, *own]
+
     def indices(self, *states: str) -> list[int]:
         """Return the indices of the missions in one of these states."""
         return [j for j, entry in enumerate(self.entries) if entry.row["state"] in states]
