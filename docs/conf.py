@@ -12,12 +12,15 @@ from sphinx.application import Sphinx
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE / "extensions"))
 
+from api_pages import contents  # noqa: E402
+
 project = "trustbo"
 author = "The trustbo developers"
 project_copyright = f"2026, {author}"
 version = release = installed_version("trustbo")
 
 extensions = [
+    "api_pages",
     "mathml",
     "myst_nb",
     "sphinx.ext.autodoc",
@@ -45,6 +48,10 @@ napoleon_use_rtype = False
 default_role = "code"  # docstrings quote names in single backticks
 autosummary_imported_members = True
 autosummary_ignore_module_all = False
+autosummary_context = {"contents": contents()}
+autosummary_filename_map = {  # some file systems do not distinguish it from trustbo.workspace
+    "trustbo.Workspace": "trustbo.Workspace-class",
+}
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_preserve_defaults = True
