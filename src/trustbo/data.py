@@ -130,6 +130,13 @@ class Mission(Summary):
     Raises:
         TrustboError: The bounds do not fit the path, or disagree on robots or features, or the
             status or the scale is unknown.
+
+    Example:
+        >>> rates = np.array([[0.9, 1.0], [0.4, 0.8]])  # (bound, robot)
+        >>> unmeasured = np.full((2, 2, 2), np.nan)  # awareness, (bound, robot, feature)
+        >>> mission = tb.Mission.from_arrays([(2, 0), (1, 0), (0, 1)], unmeasured, rates)
+        >>> mission.bounds[1].cell
+        (0, 1)
     """
 
     path: tuple[Cell, ...]

@@ -18,7 +18,14 @@ Python does not skip a file if the prefix is its whole name.
 
 
 class TrustboError(ValueError):
-    """Error for invalid input; the message names the value and the remedy."""
+    """Error for invalid input; the message names the value and the remedy.
+
+    Example:
+        >>> try:
+        ...     tb.Robot(speed=-1.0)
+        ... except tb.TrustboError as error:
+        ...     print(error)
+    """
 
 
 class PosteriorError(TrustboError):
@@ -27,6 +34,13 @@ class PosteriorError(TrustboError):
     Attributes:
         posterior: Rejected posterior (ArviZ DataTree), for inspection.
         reason: Message without the remedy.
+
+    Example:
+        >>> try:
+        ...     posterior = tb.fit(missions)
+        ... except tb.PosteriorError as error:
+        ...     print(error.reason)
+        ...     posterior = error.posterior  # for inspection
     """
 
     def __init__(self, reason: str, posterior: object = None, remedy: str = "") -> None:

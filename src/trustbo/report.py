@@ -60,6 +60,9 @@ def write_report(path: FilePath, result: Result) -> None:
 
     Raises:
         TrustboError: There is no posterior yet, or the file cannot be written.
+
+    Example:
+        >>> tb.report.write_report("report.html", result)
     """
     require_kind("result", result, Result, "give a result or a campaign")
     _ = result.posterior  # raises if there is none yet

@@ -40,6 +40,9 @@ class Robot:
     Raises:
         TrustboError: A value is not positive, an angle exceeds 90 degrees, a fraction exceeds 1, or
             a number of scans is not a whole number.
+
+    Example:
+        >>> tb.Team(robots=[tb.Robot(lidar_range=60.0, max_slope=np.radians(20.0))] * 3)
     """
 
     speed: float = 2.0

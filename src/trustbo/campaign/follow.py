@@ -31,6 +31,14 @@ class Follower(Summary):
         bounds: Bounds that have ended.
         trust: Current trust, shapes (robot,); during a bound, the trust if the bound ended now.
         running: Whether a bound is in progress.
+
+    Example:
+        >>> follower = tb.Follower(tb.Campaign(workspace, (9, 0), (0, 9)))
+        >>> follower.begin(t=0.0)
+        >>> follower.tick(1.0, [True, True, False])  # contact of each robot with the lead
+        >>> follower.end(t=30.0)
+        >>> follower.trust.mean.shape
+        (3,)
     """
 
     def __init__(self, campaign: Campaign) -> None:

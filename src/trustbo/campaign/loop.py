@@ -93,6 +93,11 @@ def resume(
     Raises:
         TrustboError: The folder contains no campaign or is locked by another process, the model,
             policy or simulator differs from the original, or a file is missing or damaged.
+
+    Example:
+        >>> campaign = tb.resume("hills", n_iterations=2)
+        >>> len(campaign.missions)
+        2
     """
     with Campaign.load(directory, model=model, policy=policy, progress=progress) as campaign:
         state = campaign.state

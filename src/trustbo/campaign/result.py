@@ -66,6 +66,11 @@ class Result(Summary):
         workspace: Workspace of the campaign.
         state: Missions with their plans and posteriors, failures, and settings.
         learner: The model, as campaigns use it.
+
+    Example:
+        >>> result = tb.iterate(workspace, (9, 0), (0, 9), n_iterations=2)
+        >>> result.trust("r2", (3, 4)).mean()
+        >>> result.plot_maps()[0].figure.savefig("maps.png")
     """
 
     def __init__(self, workspace: Workspace, state: State, learner: Learner, base: Planner) -> None:
@@ -439,6 +444,10 @@ def load_result(
     Raises:
         TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is
             missing or damaged.
+
+    Example:
+        >>> result = tb.load_result("hills")
+        >>> result.table
     """
     state, workspace, pending, _ = read_campaign(directory)
     for entry in pending:  # recorded, but not learned yet

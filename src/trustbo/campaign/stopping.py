@@ -39,6 +39,11 @@ class RegretBound:
 
     Raises:
         TrustboError: `eps` or `delta` is outside (0, 1).
+
+    Example:
+        >>> stop = tb.RegretBound(eps=0.02, delta=0.1)
+        >>> campaign = tb.iterate(workspace, (9, 0), (0, 9), n_iterations=4, stop=stop)
+        >>> campaign.stop_reason
     """
 
     eps: float = 0.05

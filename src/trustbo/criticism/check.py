@@ -93,6 +93,10 @@ def check(
     Raises:
         TrustboError: If the posterior is not from `fit`, was fitted to people's reports, or
             contains no data although `missions` is None.
+
+    Example:
+        >>> result = tb.iterate(workspace, (9, 0), (0, 9), n_iterations=2)
+        >>> tb.check(result.posteriors).verdict
     """
     trees = posterior if isinstance(posterior, Sequence) else [posterior]
     tree = last_posterior("check", trees)

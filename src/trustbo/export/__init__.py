@@ -25,6 +25,11 @@ def export_result(
 
     The formats are geotiff, geojson, csv and nav2. Raises TrustboError if a format is unknown, or a
     file cannot be written.
+
+    Example:
+        >>> files = tb.export.export_result(result, "field", ["geotiff", "nav2"])
+        >>> [file.name for file in files]
+        ['maps.tif', 'nav2']
     """
     names = [
         require_choice("format", name, WRITERS)

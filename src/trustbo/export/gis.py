@@ -35,6 +35,9 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
 
     Raises:
         TrustboError: The maps have no CRS, or the file cannot be written.
+
+    Example:
+        >>> tb.export.write_geotiff("maps.tif", result.maps())
     """
     maps = maps.maps() if isinstance(maps, Result) else maps
     require_kind("maps", maps, xr.Dataset, "give a result, or maps such as result.maps()")
@@ -77,6 +80,9 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
 
     Raises:
         TrustboError: The workspace has no CRS, or the file cannot be written.
+
+    Example:
+        >>> tb.export.write_geojson("path.geojson", result.plan)
     """
     plan = plan.plan if isinstance(plan, Result) else plan
     require_kind("plan", plan, Plan, "give a Plan, for example from Campaign.ask, or a Result")
@@ -116,6 +122,9 @@ def write_csv(path: FilePath, result: Result) -> None:
 
     Raises:
         TrustboError: There is no posterior yet, or the file cannot be written.
+
+    Example:
+        >>> tb.export.write_csv("missions.csv", result)
     """
     require_kind("result", result, Result, "give a result or a campaign")
     table = to_frame(result.missions)

@@ -63,6 +63,11 @@ class Frame:
     Raises:
         TrustboError: The origin is not two finite numbers, the rotation is beyond a full turn, or
             the name is empty.
+
+    Example:
+        >>> frame = tb.export.Frame(origin=(380_000.0, 5_224_800.0), rotation=np.pi / 2.0)
+        >>> frame.of_crs([380_000.0, 5_224_810.0]).round(6)  # 10 m north of the origin
+        array([10., 0.])
     """
 
     origin: tuple[float, float]
@@ -124,6 +129,10 @@ def write_nav2(
         TrustboError: The frame is not a `Frame` or its origin is far off the map, a robot's name
             cannot be part of a file name, a robot has no route in a bound, the grid has too many
             cells for Nav2's ids, the map has too many pixels, or a file cannot be written.
+
+    Example:
+        >>> frame = tb.export.Frame(origin=(380_000.0, 5_224_800.0))
+        >>> tb.export.write_nav2("nav2", result, frame=frame)
     """
     require_kind("result", result, Result, "give a result or a campaign")
     if frame is not None:

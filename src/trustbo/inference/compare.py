@@ -57,7 +57,9 @@ def compare(
             some log-likelihoods are of tick counts and others are densities of rates.
 
     Example:
-        >>> tb.compare({"pooled": pooled, "hierarchical": hierarchical})
+        >>> pooled = tb.fit(missions, tb.models.PooledTrust())
+        >>> hierarchical = tb.fit(missions, tb.models.HierarchicalTrust())
+        >>> tb.compare({"pooled": pooled, "hierarchical": hierarchical})[["rank", "elpd_diff"]]
     """
     if not isinstance(posteriors, Mapping) or len(posteriors) < 2:
         raise TrustboError(

@@ -354,6 +354,11 @@ def sample_prior(
         n_draws: Number of draws.
         seed: Random seed; the same seed gives the same draws.
         n_robots: Number of robots, for models with separate parameters for each robot.
+
+    Example:
+        >>> model = tb.models.PooledTrust()
+        >>> draws = tb.inference.sample_prior(model, n_features=3, n_draws=500, seed=0)
+        >>> planner.plan(draws).bands.shape  # (quantile, bound, robot)
     """
     remedy = "give a model such as PooledTrust()"
     if callable(model) and not isinstance(model, type | TrustModel):

@@ -83,6 +83,12 @@ class TrustFilter:
         n_bounds: Number of bounds since the last `reset`.
         likelihood: Observation family.
         space: State-space form of each draw.
+
+    Example:
+        >>> trust = tb.inference.TrustFilter(posterior, workspace=workspace)
+        >>> awareness = workspace.along(path)  # (bound, robot, feature)
+        >>> trust.update(awareness[0], [0.9, 1.0, 0.4], bound=(path[0], path[1])).mean
+        >>> trust.predict(awareness[1:], path[1:]).rate  # contact rates of the bounds to come
     """
 
     @Renamed(observation="family")

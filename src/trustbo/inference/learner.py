@@ -390,6 +390,10 @@ def params_of(
     Raises:
         TrustboError: If the posterior is not from `fit`; a variable is missing or has NaN draws; or
             features or robots differ from those of the workspace.
+
+    Example:
+        >>> params = tb.inference.params_of(posterior, workspace)  # leading axis (draw,)
+        >>> tb.Planner(workspace, (9, 0), (0, 9)).plan(params.mean()).path
     """
     require_posterior("params_of", posterior)
     learner = learner_of_posterior(posterior, model)
@@ -431,6 +435,11 @@ def add_latent(
 
     Raises:
         TrustboError: If the posterior contains no data and no missions are given.
+
+    Example:
+        >>> posterior = tb.fit(missions, workspace=workspace, latent=False)
+        >>> tb.inference.add_latent(posterior)["latent"]["trust_mean"].dims
+        ('mission', 'bound', 'robot')
     """
     if "latent" in require_posterior("add_latent", posterior).children:
         return posterior

@@ -107,6 +107,10 @@ def loo(posterior: xr.DataTree, *, model: Model | None = None, progress: bool = 
     Raises:
         TrustboError: If fewer than two missions have measured rates, or a DataTree that is not from
             `fit` cannot be evaluated.
+
+    Example:
+        >>> elpd = tb.inference.loo(posterior)
+        >>> elpd.elpd, elpd.se
     """
     return estimated(left_out("loo", posterior, model), progress=progress)
 

@@ -65,6 +65,11 @@ def predict_reports(
     Raises:
         TrustboError: If the posterior is not of `HumanTrust`, or the missions have different inputs
             or a different scale.
+
+    Example:
+        >>> people = tb.logs.read_reports("answers.csv", outcome="outcome", scale="likert7")
+        >>> posterior = tb.fit(people)
+        >>> tb.inference.predict_reports(posterior, people, fitted=True).attrs["mae"]
     """
     if not is_of_people(require_posterior("predict_reports", posterior)):
         raise TrustboError(

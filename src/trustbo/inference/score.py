@@ -75,6 +75,10 @@ def score(
         TrustboError: If a posterior is not from `fit`; the numbers of posteriors and missions do
             not match; there is no mission to predict; a path leaves the grid of place effects; or
             tick counts are missing.
+
+    Example:
+        >>> scores = tb.inference.score(result.posteriors)  # of each mission, given those before it
+        >>> float(scores["coverage_90"])
     """
     require_whole("seed", seed, 0)
     if missions is None and isinstance(posterior, Posteriors):

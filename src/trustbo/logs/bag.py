@@ -57,6 +57,10 @@ def read_bag(
     Raises:
         TrustboError: rosbags is not installed, the path is not a complete bag, a topic is missing
             or of another type, markers are out of order, or `Mission` rejects the data.
+
+    Example:
+        >>> missions = tb.logs.read_bag("log.bag", workspace)
+        >>> posterior = tb.fit(missions, workspace=workspace)
     """
     files = [path] if isinstance(path, str | PathLike) else path
     paths = [Path(file) for file in files]

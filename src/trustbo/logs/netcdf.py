@@ -90,7 +90,11 @@ def _seal_of(content: bytes) -> bytes:
 
 
 def write_missions(path: FilePath, missions: Sequence[Mission]) -> None:
-    """Write missions with the same robots and features, and their ticks, to a netCDF file."""
+    """Write missions with the same robots and features, and their ticks, to a netCDF file.
+
+    Example:
+        >>> tb.logs.write_missions("missions.nc", result.missions)
+    """
     write_tree(path, missions_to_tree(missions))
 
 
@@ -102,6 +106,11 @@ def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
 
     Raises:
         TrustboError: A file does not exist, is damaged, or contains no missions.
+
+    Example:
+        >>> missions = tb.logs.read_missions("missions.nc")
+        >>> missions[0].status
+        'ok'
     """
     paths: Any = path
     if isinstance(path, str | PathLike) or not isinstance(path, Sequence):

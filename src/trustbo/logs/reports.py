@@ -49,6 +49,10 @@ def read_reports(
     Raises:
         TrustboError: A column is missing, a row is repeated, a value has the wrong type or is off
             the scale, a person has no reports, or there is neither an outcome nor an input.
+
+    Example:
+        >>> people = tb.logs.read_reports("answers.csv", outcome="outcome", scale="likert7")
+        >>> posterior = tb.fit(people)  # of HumanTrust
     """
     levels = levels_of(scale)
     columns = {"person": person, "step": step, "report": report}

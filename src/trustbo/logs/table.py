@@ -37,6 +37,9 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
         TrustboError: The missions have different robots or features, only some of them have a path,
             a feature has the name of another column, or the name of a robot or feature would be
             changed by a CSV file or is a formula of spreadsheets.
+
+    Example:
+        >>> tb.logs.to_frame(missions).to_csv("log.csv", index=False)
     """
     require_same_team(missions)
     taken = {folded(name) for name in (*COLUMNS, *TRUST, *_NO_FEATURES)}
@@ -91,6 +94,10 @@ def read_table(table: Any) -> list[Mission]:
     Raises:
         TrustboError: A column, bound or robot is missing, a row is repeated, a value has the wrong
             type, rows of one bound disagree on its cell, or `Mission` rejects the data.
+
+    Example:
+        >>> missions = tb.logs.read_table("log.csv")
+        >>> posterior = tb.fit(missions, workspace=workspace)
     """
     columns = Columns(table)
     known = [columns.find(name) for name in (*COLUMNS, *TRUST)]

@@ -72,6 +72,11 @@ def read_tracks(
         UserWarning: A watcher is unknown, detections lie outside the time of the poses, their
             interval is not the tick, a robot is never seen or never watches, or the lead leaves the
             planned path.
+
+    Example:
+        >>> missions = tb.logs.read_tracks("poses.csv", "detections.csv", window=20.0)
+        >>> missions[0].robots
+        ('spot', 'husky')
     """
     tick = require_positive("tick", tick)
     window = require_positive("window", window)

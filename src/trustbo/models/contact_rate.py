@@ -27,20 +27,7 @@ class ContactRate(dist.Distribution):
     that were not measured.
 
     For `tb.fit` and `tb.Campaign`, give a function with this distribution at the site
-    `contact_rate`. `drift` may be any JAX function of the inputs and of sampled variables:
-
-    >>> def saturating(awareness, features, contact_rate=None):
-    ...     sight = awareness[..., features.index("line_of_sight")]
-    ...     rise = numpyro.sample("rise", dist.HalfNormal(0.5))
-    ...     with numpyro.plate("robot", awareness.shape[2]):
-    ...         level = numpyro.sample("level", dist.Normal(0.2, 0.2))
-    ...     beta0 = numpyro.sample("beta0", dist.Beta(2.0, 2.0))
-    ...     delta_w = numpyro.sample("delta_w", dist.HalfNormal(0.1))
-    ...     delta_v = numpyro.sample("delta_v", dist.HalfNormal(0.1))
-    ...     drift = level + rise * (1.0 - jnp.exp(-5.0 * sight))
-    ...     with numpyro.plate("mission", len(awareness)):
-    ...         rates = tb.models.ContactRate(drift, beta0, delta_w, delta_v)
-    ...         numpyro.sample("contact_rate", rates, obs=contact_rate)
+    `contact_rate`. `drift` may be any JAX function of the inputs and of sampled variables.
 
     The function is called with the inputs that its parameters name: awareness (mission, bound,
     robot, feature); contact_rate, n_ticks and duration in s (mission, bound, robot); cell (mission,
@@ -49,6 +36,21 @@ class ContactRate(dist.Distribution):
     indices are -1, and other inputs are 0. Ticks and durations that are not known, as before a
     mission, are NaN. To plan, the drift of a bound may depend only on awareness, cell and move of
     this bound. Sample a variable of each mission within the plate of missions.
+
+    Example:
+        >>> def saturating(awareness, features, contact_rate=None):
+        ...     sight = awareness[..., features.index("line_of_sight")]
+        ...     rise = numpyro.sample("rise", dist.HalfNormal(0.5))
+        ...     with numpyro.plate("robot", awareness.shape[2]):
+        ...         level = numpyro.sample("level", dist.Normal(0.2, 0.2))
+        ...     beta0 = numpyro.sample("beta0", dist.Beta(2.0, 2.0))
+        ...     delta_w = numpyro.sample("delta_w", dist.HalfNormal(0.1))
+        ...     delta_v = numpyro.sample("delta_v", dist.HalfNormal(0.1))
+        ...     drift = level + rise * (1.0 - jnp.exp(-5.0 * sight))
+        ...     with numpyro.plate("mission", len(awareness)):
+        ...         rates = tb.models.ContactRate(drift, beta0, delta_w, delta_v)
+        ...         numpyro.sample("contact_rate", rates, obs=contact_rate)
+        >>> posterior = tb.fit(missions, saturating)
     """
 
     support = constraints.independent(constraints.real, 2)  # pyright: ignore

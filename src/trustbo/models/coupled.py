@@ -28,6 +28,10 @@ class CoupledTrust(TrustModel):
 
     `Priors.coupling` is the prior on the off-diagonal entries of B0 and B_m. The covariances are
     diag(sd) R diag(sd), with an LKJ prior on the correlations R.
+
+    Example:
+        >>> posterior = tb.fit(missions, tb.models.CoupledTrust())
+        >>> posterior["posterior"]["B0"].mean(("chain", "draw"))
     """
 
     @property

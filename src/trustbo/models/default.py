@@ -17,7 +17,9 @@ def default_model(*, places: bool = True, priors: Priors | None = None) -> Poole
     Example:
         >>> priors = tb.models.Priors.from_features(workspace.features)
         >>> priors = dataclasses.replace(priors, delta_v=dist.HalfNormal(0.05))
-        >>> tb.iterate(workspace, (9, 0), (0, 9), model=tb.models.default_model(priors=priors))
+        >>> campaign = tb.Campaign(
+        ...     workspace, (9, 0), (0, 9), model=tb.models.default_model(priors=priors)
+        ... )
     """
     effects = (PlaceEffect(), RobotEffect()) if places else (RobotEffect(),)
     return PooledTrust(effects=effects) if priors is None else PooledTrust(priors, effects=effects)

@@ -20,6 +20,10 @@ class HierarchicalTrust(PooledTrust):
     beta_{i,m} ~ N(mean_beta_m, tau_beta_m^2) and b_i ~ N(mean_b, tau_b^2). The means have the same
     priors as pooled coefficients, and the standard deviations tau have the prior `Priors.tau`. All
     robots share beta0 and the noise scales.
+
+    Example:
+        >>> posterior = tb.fit(missions, tb.models.HierarchicalTrust())
+        >>> posterior["posterior"]["beta"].mean(("chain", "draw"))  # (robot, feature)
     """
 
     @property

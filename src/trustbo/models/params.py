@@ -264,6 +264,11 @@ class TrustParams(ParameterDraws, _Trust):
         memory: Quantity carried over between bounds, `"level"` or `"deviation"`; see `PooledTrust`.
         delta_s: Standard deviation of the noise that all robots share, shape (...,), or None.
         place_robot: Effects of robots in bounds, in forecasts of the default model, or None.
+
+    Example:
+        >>> beta = np.array([0.1, 0.1, 0.3])  # of traversability, visibility and line of sight
+        >>> truth = tb.models.TrustParams(0.5, beta, b=0.0, delta_w=0.05, delta_v=0.05)
+        >>> tb.simulation.ModelSimulator(workspace, truth).run(path, seed=0).contact_rate
     """
 
     __slots__ = ()
@@ -279,6 +284,14 @@ class RobotParams(ParameterDraws, _Trust):
 
     The fields are those of `TrustParams`, but beta has the shape (..., robot, feature), and beta0,
     b, delta_w and delta_v have the shape (..., robot).
+
+    Example:
+        >>> beta = np.tile([0.1, 0.1, 0.3], (3, 1))  # (robot, feature)
+        >>> beta[1] /= 2.0  # r2 detects less
+        >>> half, noise = np.full(3, 0.5), np.full(3, 0.05)
+        >>> params = tb.models.RobotParams(half, beta, np.zeros(3), noise, noise)
+        >>> planner.plan(params).trust.mean(axis=0).argmin().item()
+        1
     """
 
     __slots__ = ()
@@ -310,6 +323,11 @@ class CoupledParams(ParameterDraws, _Coupled):
     The fields are B0 (..., robot, robot'), B (..., feature, robot, robot'), b (..., robot), and the
     covariances Delta_w and Delta_v (..., robot, robot'). The fields x0_mean, x0_sd, place,
     place_bound and place_robot are the same as in `TrustParams`.
+
+    Example:
+        >>> posterior = tb.fit(missions, tb.models.CoupledTrust())
+        >>> params = tb.inference.params_of(posterior)
+        >>> params.B0.mean(axis=0)  # influence of each robot on each other one
     """
 
     __slots__ = ()

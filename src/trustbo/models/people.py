@@ -49,6 +49,11 @@ class HumanTrust(PooledTrust):
 
     Raises:
         TrustboError: If the scale is unknown, a tau is not positive, or an effect is given.
+
+    Example:
+        >>> people = tb.logs.read_reports("answers.csv", outcome="outcome", scale="likert7")
+        >>> posterior = tb.fit(people, tb.models.HumanTrust(scale="likert7", tau_gain=0.1))
+        >>> posterior["posterior"]["beta"].mean(("chain", "draw"))  # after success and failure
     """
 
     memory: str = "deviation"

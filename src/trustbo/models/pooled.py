@@ -28,6 +28,10 @@ class PooledTrust(TrustModel):
             `"deviation"` for the deviation of trust from the mean given features and effects.
         shared_noise: Whether the rates of all robots in a bound share the noise delta_s s_k, where
             s_k is standard normal.
+
+    Example:
+        >>> posterior = tb.fit(missions, tb.models.PooledTrust(family="beta_binomial"))
+        >>> posterior["posterior"]["beta"].mean(("chain", "draw"))
     """
 
     memory: str = "level"  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -67,6 +67,10 @@ class Priors(Summary):
     Raises:
         TrustboError: If a prior has the wrong shape or support, the prior on a weight is not
             Normal, or `concentration`, `x0_mean` or `x0_sd` is invalid.
+
+    Example:
+        >>> priors = tb.models.Priors(beta0=dist.Beta(2.0, 4.0), beta=dist.Normal(0.0, 0.5))
+        >>> model = tb.models.default_model(priors=priors)
     """
 
     beta0: Distribution = field(default_factory=partial(_built, dist.Beta, 2.0, 2.0))

@@ -61,6 +61,10 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
 
     Raises:
         TrustboError: There is no such mission, or the posterior has no latent trust.
+
+    Example:
+        >>> tb.plots.trust_curves(result.posterior)  # trust in the last mission
+        >>> tb.plots.trust_curves(result.plan)  # trust predicted along the recommended path
     """
     if isinstance(given, Plan):
         x = np.arange(1, len(given.trust) + 1)
@@ -196,6 +200,9 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
 
     Raises:
         TrustboError: A column is missing.
+
+    Example:
+        >>> tb.plots.robot_effects(tb.check(result.posteriors).robots)
     """
     for name in ("mission", "robot", "effect", "sd", "stands_out"):
         require_choice("column", name, [str(column) for column in table.columns])

@@ -84,6 +84,10 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
 
     Returns:
         Page, which notebooks display and `save` writes to a file.
+
+    Example:
+        >>> page = tb.plots.explore(result.plan, result.maps(), result.history)
+        >>> page.save("explore.html")
     """
     require_kind("plan", plan, Plan, "give a Plan, such as Result.plan")
     require_kind("maps", maps, xr.Dataset, "give maps, such as Result.maps()")

@@ -33,6 +33,9 @@ def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
 
     Returns:
         Axes of the figure.
+
+    Example:
+        >>> tb.plots.grid_map(workspace).figure.savefig("grid.png")
     """
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
     grid = workspace.grid

@@ -99,6 +99,10 @@ def trust_maps(
 
     Returns:
         Axes, shape (panel,).
+
+    Example:
+        >>> maps = result.history, result.trust_map, result.path
+        >>> tb.plots.trust_maps(*maps, workspace, missions=[1])
     """
     require_kind("history", history, xr.Dataset, "give Result.history")
     require_kind("trust_map", trust_map, xr.DataArray, "give Result.trust_map")
@@ -170,6 +174,9 @@ def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
 
     Raises:
         TrustboError: The workspace has no terrain.
+
+    Example:
+        >>> tb.plots.terrain_maps(workspace)[0].figure.savefig("terrain.png")
     """
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
     terrain = workspace.terrain
@@ -232,6 +239,9 @@ def cell_map(
 
     Returns:
         Axes of the map; the image of the map is `images[0]` of these axes.
+
+    Example:
+        >>> tb.plots.cell_map(result.maps()["trust_sd"], workspace, path=result.path)
     """
     require_kind("values", values, xr.DataArray, "give a map of the cells")
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")

@@ -41,6 +41,9 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
 
     Raises:
         TrustboError: The workspace has no terrain, or there is no such bound.
+
+    Example:
+        >>> tb.plots.plan_map(result.plan, bounds=[1, 2])
     """
     require_kind("plan", plan, Plan, "give a Plan, such as Result.plan")
     if plan.stops is None:

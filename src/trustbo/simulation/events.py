@@ -32,6 +32,11 @@ class Event:
     Attributes:
         first: First mission with the event; missions are counted from 0.
         last: Last mission with the event; None if the event does not end.
+
+    Example:
+        >>> event = tb.simulation.Dust(detection=0.5, first=2, last=4)
+        >>> [event.acts_in(mission) for mission in (1, 2, 4, 5)]
+        [False, True, True, False]
     """
 
     SHARES: ClassVar[tuple[str, ...]] = ()
@@ -64,6 +69,11 @@ class Jam(Event):
         center: Centre of the circle.
         radius: Radius of the circle, in metres.
         strength: Strength in [0, 1]; the detection probability is multiplied by 1 - `strength`.
+
+    Example:
+        >>> center = workspace.grid.center((4, 4))  # x and y, metres of the CRS
+        >>> jam = tb.simulation.Jam(center, radius=40.0, strength=0.8, first=3)
+        >>> simulator = tb.simulation.KinematicSimulator(workspace, events=[jam])
     """
 
     SHARES = ("strength",)
@@ -89,6 +99,10 @@ class Degradation(Event):
     Attributes:
         robot: Name of the robot.
         detection: Factor by which the detection probability is multiplied, in [0, 1].
+
+    Example:
+        >>> poor = tb.simulation.Degradation("r2", detection=0.5, first=3)
+        >>> simulator = tb.simulation.KinematicSimulator(workspace, events=[poor])
     """
 
     SHARES = ("detection",)
@@ -110,6 +124,10 @@ class Dust(Event):
 
     Attributes:
         detection: Factor by which the detection probability is multiplied, in [0, 1].
+
+    Example:
+        >>> dust = tb.simulation.Dust(detection=0.5, first=2, last=4)  # in three missions
+        >>> simulator = tb.simulation.KinematicSimulator(workspace, events=[dust])
     """
 
     SHARES = ("detection",)
@@ -131,6 +149,11 @@ class Trees(Event):
         height: Height of the canopy above the ground, in metres; 0 if trees were felled.
         center: Centre of the circle.
         radius: Radius of the circle, in metres.
+
+    Example:
+        >>> center = workspace.grid.center((4, 4))  # x and y, metres of the CRS
+        >>> grown = tb.simulation.Trees(height=12.0, center=center, radius=30.0, first=6)
+        >>> simulator = tb.simulation.KinematicSimulator(workspace, events=[grown])
     """
 
     height: float
@@ -156,6 +179,10 @@ class Season(Event):
 
     Attributes:
         extinction: Positive factor on the extinction coefficient of the true model of sight.
+
+    Example:
+        >>> leaves = tb.simulation.Season(extinction=3.0, first=6)
+        >>> simulator = tb.simulation.KinematicSimulator(workspace, events=[leaves])
     """
 
     extinction: float
@@ -185,6 +212,10 @@ class Fouling(Event):
         every: Number of bounds between the starts of successive missions. It should be at least the
             number of bounds of a path.
         seed: Seed of the random factors.
+
+    Example:
+        >>> fouling = tb.simulation.Fouling(worst=0.1, seed=1)
+        >>> simulator = tb.simulation.KinematicSimulator(workspace, events=[fouling])
     """
 
     SHARES = ("worst", "correlation")

@@ -49,8 +49,9 @@ class KinematicSimulator(DescribedSimulator):
     To simulate a different kind of motion, derive from this class and override `drive`.
 
     Example:
-        >>> jam = tb.simulation.Jam(center=(1748000.0, 5427000.0), radius=40.0, first=3)
-        >>> tb.simulation.KinematicSimulator(workspace, events=[jam]).run(path, seed=0)
+        >>> jam = tb.simulation.Jam(workspace.grid.center((4, 4)), radius=40.0)
+        >>> simulator = tb.simulation.KinematicSimulator(workspace, events=[jam])
+        >>> simulator.run(path, seed=0).contact_rate.mean()
     """
 
     def __init__(

@@ -25,6 +25,11 @@ class ModelSimulator(DescribedSimulator):
 
     Because the true parameters are known, posteriors and plans of a campaign can be compared with
     the truth: `Planner.plan(params)` and, for a given path, `Planner.evaluate(path, params)`.
+
+    Example:
+        >>> truth = tb.inference.params_of(posterior, workspace).draw(0)
+        >>> simulator = tb.simulation.ModelSimulator(workspace, truth)
+        >>> tb.iterate(workspace, (9, 0), (0, 9), n_iterations=1, simulator=simulator)
     """
 
     def __init__(

@@ -50,7 +50,7 @@ class RealtimeAwareness(DescribedSimulator):
 
     Example:
         >>> robots = tb.simulation.RealtimeAwareness(tb.simulation.KinematicSimulator(workspace))
-        >>> tb.iterate(workspace, (9, 0), (0, 9), simulator=robots, awareness="measured")
+        >>> robots.run(path, seed=0).awareness  # (bound, robot, feature)
     """
 
     def __init__(

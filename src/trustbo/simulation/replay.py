@@ -15,6 +15,10 @@ class ReplaySimulator(DescribedSimulator):
 
     Attributes:
         missions: All missions, in the recorded order.
+
+    Example:
+        >>> replay = tb.simulation.ReplaySimulator(tb.logs.read_missions("missions.nc"))
+        >>> again = tb.iterate(workspace, (9, 0), (0, 9), n_iterations=2, simulator=replay)
     """
 
     def __init__(self, missions: Sequence[Mission], *, any_path: bool = False) -> None:

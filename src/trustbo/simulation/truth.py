@@ -35,6 +35,11 @@ class Truth(Summary):
             `contact` is the mean over robots of the expected contact rate if the bound does not
             fail, or 0 if it failed in all replicates. `passed` is the probability that the bound
             does not fail. Both are NaN where there is no bound.
+
+    Example:
+        >>> simulator = tb.simulation.RadioSimulator(workspace)
+        >>> truth = tb.simulation.Truth.from_simulator(simulator)
+        >>> truth.lost(truth.best((9, 0), (0, 9)))  # bounds of contact
     """
 
     def __init__(

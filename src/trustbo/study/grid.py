@@ -28,7 +28,14 @@ _N_SHOWN = 3
 
 
 class Scene(NamedTuple):
-    """World of a simulated campaign: the assumed workspace, the simulator, start and goal."""
+    """World of a simulated campaign: the assumed workspace, the simulator, start and goal.
+
+    Example:
+        >>> def make_scene():
+        ...     simulator = tb.simulation.RadioSimulator(workspace)
+        ...     truth = tb.simulation.Truth.from_simulator(simulator)
+        ...     return tb.study.Scene(workspace, simulator, (9, 0), (0, 9), truth=truth)
+    """
 
     workspace: Workspace
     simulator: Simulator
@@ -87,7 +94,8 @@ def run_grid(
 
     Example:
         >>> cases = {"default": {}, "thompson": {"policy": "thompson"}}
-        >>> table = tb.study.run_grid(cases, {"hills": make_scene}, "out", seeds=range(3))
+        >>> scenes = {"hills": make_scene}
+        >>> table = tb.study.run_grid(cases, scenes, "out", n_missions=2, n_jobs=1)
     """
     require_count("n_missions", n_missions)
     require_kind("cases", cases, Mapping, "give a dict of cases by name")

@@ -47,6 +47,10 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
 
     Raises:
         TrustboError: If no scene has a truth.
+
+    Example:
+        >>> numbers = tb.study.numbers_of(table)  # of `run_grid`
+        >>> numbers["lost while learning"].mean()
     """
     require_kind("table", table, pd.DataFrame, "give the table of run_grid")
     if "regret" not in table:
@@ -98,6 +102,10 @@ def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataF
 
     Raises:
         TrustboError: If a column is unknown.
+
+    Example:
+        >>> numbers = tb.study.numbers_of(table)  # of `run_grid`
+        >>> tb.study.summary(numbers)["lost while learning"]
     """
     require_kind("numbers", numbers, pd.DataFrame, "give the rows of numbers_of")
     names = require_list("by", [by] if isinstance(by, str) else by, str, "give names of columns")
@@ -126,6 +134,10 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
 
     Raises:
         TrustboError: If a case or column is unknown.
+
+    Example:
+        >>> numbers = tb.study.numbers_of(table)  # of `run_grid`
+        >>> tb.study.differences(numbers, ours="default")["lost while learning"]
     """
     require_choice("case", ours, list(numbers["case"]))
     for name in by:

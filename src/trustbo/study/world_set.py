@@ -179,6 +179,11 @@ def worlds(data: FilePath | None = None) -> dict[str, World]:
 
     Returns:
         Worlds on 6 synthetic and 4 real terrains.
+
+    Example:
+        >>> worlds = tb.study.worlds()
+        >>> len(worlds)
+        81
     """
     folder = None if data is None else str(data)
     return {world.name: replace(world, data=folder) for world in _all()}

@@ -30,6 +30,13 @@ class CompositeIndex:
         fitted: Dataset of the fit: sign, limits, mean, standard deviation and loading of each
             feature; share of the variance of each component; attributes `bottom` and `top`, the
             scores that become 0 and 1.
+
+    Example:
+        >>> slope = np.linspace(0.0, 0.5, 100)
+        >>> features = {"slope": slope, "roughness": slope**2}
+        >>> index = tb.terrain.CompositeIndex({"slope": -1, "roughness": -1}).fit(features)
+        >>> index.transform(features)[[0, -1]]
+        array([1., 0.])
     """
 
     def __init__(self, signs: Mapping[str, int], fitted: xr.Dataset | None = None) -> None:

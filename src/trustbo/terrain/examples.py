@@ -25,6 +25,10 @@ def example() -> xr.Dataset:
 
     Returns:
         Dataset as from `read_terrain`.
+
+    Example:
+        >>> terrain = tb.terrain.example()
+        >>> (terrain["dsm"] - terrain["dem"]).max().item()  # height of the tallest tree, m
     """
     return read_terrain(*EXAMPLE_FILES).assign_attrs(
         attribution="Copyright in this work is owned by Greater Wellington Regional Council; "
@@ -55,6 +59,11 @@ def synthetic_terrain(
 
     Raises:
         TrustboError: A size is under 4 pixels, or an argument is negative.
+
+    Example:
+        >>> terrain = tb.terrain.synthetic_terrain((150.0, 100.0), seed=3)
+        >>> terrain["dem"].shape
+        (150, 100)
     """
     step = require_positive("resolution", resolution)
     sides = require_tuple("size", size, 2)

@@ -43,6 +43,13 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
     """Register a function as a feature of pixels under a new name (decorator).
 
     Raises TrustboError if the name is no text or is taken, or the sign is neither 1 nor -1.
+
+    Example:
+        >>> @tb.terrain.feature("bush", sign=-1)
+        ... def bush(terrain):
+        ...     return np.array(terrain["dsm"] - terrain["dem"] > 0.5, dtype=float)
+        >>> names = {"traversability": ["slope", "bush"]}
+        >>> tb.Workspace.from_terrain(tb.terrain.example(), (4, 4), features=names)
     """
     require_kind("name of the feature", name, str, "give a text, such as 'stones'")
     if name in FEATURES:
@@ -69,7 +76,14 @@ def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
 
 
 def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
-    """Compute the gradient of the ground to the east and north (Horn 1981), (2, row, col)."""
+    """Compute the gradient of the ground to the east and north (Horn 1981), (2, row, col).
+
+    Example:
+        >>> dem = np.tile(np.arange(5.0), (5, 1))  # rises by 1 m per pixel to the east
+        >>> east, north = tb.terrain.gradient(dem, pixel=(1.0, 1.0))
+        >>> east[2, 2].item()
+        1.0
+    """
     if getattr(dem, "ndim", 0) != 2 or not dem.size or dem.dtype.kind not in "iuf":
         raise TrustboError(f"dem must be an array of heights (row, col); got {one_line(dem)}.")
     return horn_gradient(dem, require_tuple("pixel", pixel, 2))

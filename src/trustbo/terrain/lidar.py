@@ -45,6 +45,10 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
     Raises:
         TrustboError: laspy is not installed; the file is unreadable or has no projected CRS; there
             are no ground points; heights are impossible; or no pixel has both heights.
+
+    Example:
+        >>> terrain = tb.terrain.read_lidar("points.laz", resolution=1.0)
+        >>> workspace = tb.Workspace.from_terrain(terrain, shape=(4, 4))
     """
     step = require_positive("resolution", resolution)
     remedy = "give the path of one file; merge tiles first, e.g. with pdal merge"

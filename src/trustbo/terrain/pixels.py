@@ -15,7 +15,12 @@ from trustbo.errors import require_kind
 
 
 def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
-    """Return pixel height and width in metres."""
+    """Return pixel height and width in metres.
+
+    Example:
+        >>> tb.terrain.pixel_size(tb.terrain.example())
+        (1.0, 1.0)
+    """
     require_kind("terrain", terrain, xr.Dataset, "give a Dataset as from read_terrain")
     y, x = (terrain.variables[axis].values for axis in ("y", "x"))
     return abs(float(y[-1] - y[0])) / (len(y) - 1), abs(float(x[-1] - x[0])) / (len(x) - 1)

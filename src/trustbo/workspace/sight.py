@@ -36,6 +36,10 @@ class Sight:
 
     Raises:
         TrustboError: The extinction is negative, or the crown base is outside [0, 1].
+
+    Example:
+        >>> dense = tb.workspace.Sight(extinction=0.3)
+        >>> simulator = tb.simulation.KinematicSimulator(workspace, sight=dense)  # the true sight
     """
 
     extinction: float = 0.1

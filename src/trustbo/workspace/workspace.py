@@ -57,6 +57,11 @@ class Workspace(Summary):
         pixels: Dataset (y, x) of each feature and of `passable`; None without a terrain.
         composites: Fitted composite indices, keyed by feature.
         posts: The robots' stops, posts and routes on the terrain; None without a terrain.
+
+    Example:
+        >>> terrain = tb.terrain.example()
+        >>> workspace = tb.Workspace.from_terrain(terrain, shape=(4, 4))
+        >>> workspace.awareness.sel(feature="line_of_sight").mean("robot").max("move")
     """
 
     awareness: xr.DataArray

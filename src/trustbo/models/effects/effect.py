@@ -56,6 +56,12 @@ class Effect:
 
     Raises:
         TrustboError: If a prior scale is not positive.
+
+    Example:
+        >>> [effect.group for effect in tb.models.default_model().effects]
+        ['places', 'robots']
+        >>> isinstance(tb.models.PlaceEffect(), tb.models.Effect)
+        True
     """
 
     names: ClassVar[tuple[str, ...]] = ()

@@ -54,6 +54,11 @@ class PlaceEffect(Effect):
 
     Raises:
         TrustboError: If a setting is not positive.
+
+    Example:
+        >>> model = tb.models.PooledTrust(effects=[tb.models.PlaceEffect(tau_s=0.4)])
+        >>> posterior = tb.fit(missions, model, workspace=workspace)
+        >>> posterior["places"]["place"].mean(("chain", "draw"))  # (effect, row, col)
     """
 
     tau_s: float = 0.2

@@ -35,6 +35,11 @@ class RobotEffect(Effect):
 
     Raises:
         TrustboError: If a scale is not positive, or rho is not between 0 and 1.
+
+    Example:
+        >>> model = tb.models.PooledTrust(effects=[tb.models.RobotEffect(rho=0.99)])
+        >>> posterior = tb.fit(missions, model)
+        >>> posterior["robots"]["robot_effect"].mean(("chain", "draw"))  # (mission, robot)
     """
 
     tau_slow: float = 0.2
