@@ -21,6 +21,7 @@ version = release = installed_version("trustbo")
 
 extensions = [
     "api_pages",
+    "gallery",
     "mathml",
     "myst_nb",
     "sphinx.ext.autodoc",
@@ -28,7 +29,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
 ]
-exclude_patterns = ["_build", "extensions", "paper"]
+exclude_patterns = ["_build", "extensions", "generated/gallery", "paper"]
 templates_path = ["_templates"]
 
 # Pages are Markdown. Notebooks are stored with their outputs and not executed here.
