@@ -24,6 +24,8 @@ BLOCK = re.compile(r"^```python\n(.*?)^```(?:\n+```text\n(.*?)^```)?", flags=re.
 """An example, and what the page says that it prints, if it does."""
 TOKEN = re.compile(r"[^\W\d]\w*|[+-]?\d+\.?\d*(?:e[+-]?\d+)?|\S|\n")
 """A word, a number, a sign of layout such as a bracket, or the end of a line."""
+TERM = re.compile(r"\{term\}`(?:[^<`]*<)?([^>`]+)>?`")
+"""A term of the glossary to which a page refers."""
 NUMBER, WHOLE = re.compile(r"[+-]?\d"), re.compile(r"[+-]?\d+")
 
 
@@ -110,6 +112,14 @@ def test_pages_to_which_messages_refer_exist():
     assert pages
     for page in pages:
         assert (ROOT / "docs" / f"{page}.md").exists(), f"docs/{page}.md is not there"
+
+
+def test_terms_to_which_pages_refer_are_in_the_glossary():
+    glossary = (ROOT / "docs" / "glossary.md").read_text()
+    entries = set(re.findall(r"^([^\s:#].*)$", glossary.partition(":::{glossary}")[2], flags=re.M))
+    used = [term for page in PAGES for term in TERM.findall(page.read_text())]
+    assert used
+    assert [term for term in used if term not in entries] == []
 
 
 def anchors_of(text):
