@@ -19,8 +19,11 @@ from trustbo.statespace.matrices import apply, root
 class ContactRate(dist.Distribution):
     """Distribution of contact rates given the drift, with trust integrated out.
 
+    Trust x_k and contact rates y_k in bound k are ::
+
         d_k = beta0 d_{k-1} + drift_k + delta_w w_k,    d_0 ~ N(x0_mean, x0_sd^2)
-        x_k = d_k + offset_k,    y_k = x_k + delta_v v_k + delta_s s_k
+        x_k = d_k + offset_k
+        y_k = x_k + delta_v v_k + delta_s s_k
 
     These are equations (3)-(4) of the paper. If beta0, delta_w or delta_v is a matrix, they are
     (1)-(2). The batch shape is (mission,) and the event shape is (bound, robot). NaN marks rates

@@ -23,8 +23,10 @@ from trustbo.statespace.matrices import namespace
 class CoupledTrust(TrustModel):
     """Model in which robots influence each other and have separate parameters, equations (1)-(2).
 
-    x_k = B0 x_{k-1} + sum_m B_m z_{k,m} + b + w_k,  y_k = x_k + v_k,  w ~ N(0, Delta_w),
-    v ~ N(0, Delta_v)
+    The vectors x_k of trust and y_k of contact rates in bound k are ::
+
+        x_k = B0 x_{k-1} + sum_m B_m z_{k,m} + b + w_k,    w_k ~ N(0, Delta_w)
+        y_k = x_k + v_k,                                   v_k ~ N(0, Delta_v)
 
     `Priors.coupling` is the prior on the off-diagonal entries of B0 and B_m. The covariances are
     diag(sd) R diag(sd), with an LKJ prior on the correlations R.

@@ -17,9 +17,13 @@ from trustbo.models.pooled import PooledTrust
 class HierarchicalTrust(PooledTrust):
     """Model with separate coefficients for each robot, partially pooled towards a common mean.
 
-    beta_{i,m} ~ N(mean_beta_m, tau_beta_m^2) and b_i ~ N(mean_b, tau_b^2). The means have the same
-    priors as pooled coefficients, and the standard deviations tau have the prior `Priors.tau`. All
-    robots share beta0 and the noise scales.
+    The weight of feature m and the intercept of robot i are ::
+
+        beta_{i,m} ~ N(mean_beta_m, tau_beta_m^2)
+        b_i ~ N(mean_b, tau_b^2)
+
+    The means have the same priors as pooled coefficients, and the standard deviations tau have the
+    prior `Priors.tau`. All robots share beta0 and the noise scales.
 
     Example:
         >>> posterior = tb.fit(missions, tb.models.HierarchicalTrust())

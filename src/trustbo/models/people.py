@@ -31,14 +31,18 @@ SDS = "tau_start", "tau_level", "tau_gain"
 class HumanTrust(PooledTrust):
     """Model of self-reported trust as a base level plus decaying effects of past outcomes.
 
-    x^k = base^k + d^k,  d^k = beta0 d^{k-1} + gains . inputs^k + delta_w w^k,  d^0 = 0,
+    Trust x^k of a person at step k is ::
 
-    base^k = b + weights . features^k + personal level. The personal start enters d^1, and personal
-    gains enter d^k. Start, level and gains are independent, with mean 0 and standard deviations
-    tau_start, tau_level and tau_gain. A person has only one mission, so these coefficients are
-    part of the covariance of trust and have no columns. Inputs are outcomes: features whose names
-    begin with `success` or `failure`, possibly scaled by task demands. A person is stored as a
-    mission, a step as a bound, and a rated task as a robot, as in `trustbo.logs.read_reports`.
+        x^k = base^k + d^k
+        base^k = b + weights . features^k + personal level
+        d^k = beta0 d^{k-1} + gains . inputs^k + delta_w w^k,    d^0 = 0
+
+    The personal start enters d^1, and personal gains enter d^k. Start, level and gains are
+    independent, with mean 0 and standard deviations tau_start, tau_level and tau_gain. A person has
+    only one mission, so these coefficients are part of the covariance of trust and have no columns.
+    Inputs are outcomes: features whose names begin with `success` or `failure`, possibly scaled by
+    task demands. A person is stored as a mission, a step as a bound, and a rated task as a robot,
+    as in `trustbo.logs.read_reports`.
 
     Attributes:
         scale: `"unit"` for numbers in [0, 1], censored at 0 and 1; or, for example, `"likert7"` for

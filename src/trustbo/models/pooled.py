@@ -21,7 +21,12 @@ from trustbo.statespace.form import independent_robots
 class PooledTrust(TrustModel):
     """Model with one set of parameters for all robots, equations (3)-(4).
 
-    x_k = beta0 x_{k-1} + beta . z_k + b + delta_w w_k,  y_k = x_k + delta_v v_k
+    Trust x_k in a robot and its contact rate y_k in bound k are ::
+
+        x_k = beta0 x_{k-1} + beta . z_k + b + delta_w w_k
+        y_k = x_k + delta_v v_k
+
+    with the awareness z_k and independent standard normal w_k and v_k.
 
     Attributes:
         memory: Quantity carried over between bounds: `"level"` for trust, as in the paper, or

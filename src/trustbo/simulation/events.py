@@ -201,10 +201,14 @@ class Season(Event):
 class Fouling(Event):
     """Fouling of T2's lidars, which changes the detection probability from bound to bound.
 
-    The factor on the detection probability of a robot is f_t = worst + (1 - worst) Phi(z_t), where
-    z_t = correlation z_{t-1} + sqrt(1 - correlation^2) e_t and e_t is standard normal. The time of
-    bound k = 1, 2, ... in mission m = 0, 1, ... is t = m x every + k - 1. The stationary
-    distribution of f is uniform on [worst, 1], with mean (1 + worst) / 2.
+    The factor f_t on the detection probability of a robot is ::
+
+        f_t = worst + (1 - worst) Phi(z_t)
+        z_t = correlation z_{t-1} + sqrt(1 - correlation^2) e_t,    e_t ~ N(0, 1)
+
+    with the distribution function Phi of the standard normal. The time of bound k = 1, 2, ... in
+    mission m = 0, 1, ... is t = m x every + k - 1. The stationary distribution of f is uniform on
+    [worst, 1], with mean (1 + worst) / 2.
 
     Attributes:
         worst: Smallest factor, in [0, 1].

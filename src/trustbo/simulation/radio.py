@@ -38,12 +38,15 @@ _N_BETWEEN = 9
 class RadioSimulator(DescribedSimulator):
     """Simulator whose contact depends on distance, canopy cover, climb and a hidden field.
 
-    The mean contact of robot i in the bound from cell a to cell b is sigma(2.2 - 3.5 c^1.5 d -
-    0.1 h + 0.9 (0.3 + c) tanh(g) + q_i). The distance d between the centres of the cells is in
-    units of 60 m. The cover c is the fraction of ground between the cells with a canopy above
-    1.5 m, and h is the climb in metres. The value g at b is from a smooth Gaussian field, which is
-    not on any map. The quality of the robot's radio is q_i. Rates have Student t noise with 3
-    degrees of freedom and scale 0.06, and are clipped to [0, 1]. No bound fails.
+    The mean contact of robot i in the bound from cell a to cell b is ::
+
+        sigma(2.2 - 3.5 c^1.5 d - 0.1 h + 0.9 (0.3 + c) tanh(g) + q_i)
+
+    The distance d between the centres of the cells is in units of 60 m. The cover c is the fraction
+    of ground between the cells with a canopy above 1.5 m, and h is the climb in metres. The value g
+    at b is from a smooth Gaussian field, which is not on any map. The quality of the robot's radio
+    is q_i. Rates have Student t noise with 3 degrees of freedom and scale 0.06, and are clipped to
+    [0, 1]. No bound fails.
 
     Example:
         >>> simulator = tb.simulation.RadioSimulator(workspace, seed=0)

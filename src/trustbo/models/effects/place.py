@@ -28,9 +28,9 @@ _LENGTH_SCALES = (1e-6, 1e6)  # limits in cells, at which cells are independent 
 class PlaceEffect(Effect):
     """Effect of a place on the trust of robots, beyond what awareness explains.
 
-    In the bound from cell a to c, the drift of robot i is
+    In the bound from cell a to c, the drift of robot i is ::
 
-        u_i(a -> c) = beta . z_i(a -> c) + b + s(c) + e(a -> c) + r_i(a -> c).
+        u_i(a -> c) = beta . z_i(a -> c) + b + s(c) + e(a -> c) + r_i(a -> c)
 
     Here s is a Gaussian process over cells with standard deviation tau_s and a Matern 3/2
     covariance. The effects e(a -> c) ~ N(0, tau_e^2) of directed bounds are independent. The
