@@ -21,6 +21,9 @@ HERE = Path(__file__).resolve().parents[1]
 FOLDER = HERE / "generated" / "gallery"
 EXPLORER = "explore.html"
 _DPI = 110
+_NOTEBOOKS = (
+    "Jupyter notebooks with their outputs; `make jupyter` installs JupyterLab and opens them."
+)
 _START, _GOAL = (7, 0), (0, 3)
 
 
@@ -61,7 +64,8 @@ def write_gallery(app: Sphinx) -> None:
     names = json.loads((FOLDER / "figures.json").read_text())
     notebooks = [_notebook(path) for path in sorted((HERE.parent / "notebooks").glob("*.ipynb"))]
     text = ["````{container} gallery", *(_figure(name) for name in names), "````"]
-    text += ["", "## Notebooks", "", "````{container} gallery", *notebooks, "````", ""]
+    text += ["", "## Notebooks", "", _NOTEBOOKS, ""]
+    text += ["````{container} gallery", *notebooks, "````", ""]
     new = "\n".join(text)
     page = FOLDER / "figures.md"
     if not page.exists() or page.read_text() != new:
