@@ -73,6 +73,10 @@ pygments_dark_style = "github-dark"
 copybutton_prompt_text = r"\$ "
 copybutton_prompt_is_regexp = True
 
+_ARRAY_LIKE = (
+    "~jax.Array | ~numpy.ndarray | ~numpy.bool | ~numpy.number | bool | int | float | complex"
+)
+
 
 def copy_notebooks(app: Sphinx) -> None:
     """Copy the notebooks into the folder of the docs, as Sphinx reads nothing outside it."""
@@ -108,9 +112,26 @@ def drop_words_of_python(
     lines[:] = [line for line in lines if not line.startswith("Create new instance of")]
 
 
+def shorten_signature(
+    app: Sphinx,
+    kind: str,
+    name: str,
+    value: object,
+    options: Any,
+    signature: str | None,
+    result: str,
+) -> tuple[str | None, str]:
+    """Write JAX's type of arrays by its name, and hide factories, which Sphinx cannot parse."""
+    if signature is not None:
+        signature = signature.replace(_ARRAY_LIKE, "~jax.typing.ArrayLike")
+        signature = signature.replace("<factory>", "...")
+    return signature, result
+
+
 def setup(app: Sphinx) -> None:
     """Connect the functions above to Sphinx's events."""
     app.connect("builder-inited", copy_notebooks)
     app.connect("builder-inited", write_help)
     app.connect("source-read", point_to_copies)
     app.connect("autodoc-process-docstring", drop_words_of_python)
+    app.connect("autodoc-process-signature", shorten_signature)
