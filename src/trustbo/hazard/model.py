@@ -82,6 +82,10 @@ def fit_hazard(
     Raises:
         TrustboError: If the path of a mission skips cells or leaves the grid.
         PosteriorError: If the k-hat of the importance weights exceeds 0.7.
+
+    Example:
+        >>> hazard = tb.hazard.fit_hazard(missions, workspace)
+        >>> hazard["p_fail"].max().item()  # of the most dangerous bound
     """
     started = time.perf_counter()
     hazard = hazard or Hazard()

@@ -51,6 +51,10 @@ class Hazard:
 
     Raises:
         TrustboError: If an sd is not positive, or the probability in `doubt` is outside [0, 1).
+
+    Example:
+        >>> measured = tb.hazard.Hazard(doubt=(0.0, 4.0))  # the slope limit was measured
+        >>> campaign = tb.Campaign(workspace, (9, 0), (0, 9), hazard=measured)
     """
 
     intercept: tuple[float, float] = (-7.5, 1.5)

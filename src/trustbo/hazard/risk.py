@@ -39,6 +39,10 @@ class BoundRisk(Summary):
         failures: Number of failures at a known bound, shape (move, row, col).
         steepness: Degrees by which each bound exceeds the stated slope limit, shape (move, row,
             col), or None without a limit.
+
+    Example:
+        >>> risk = tb.hazard.BoundRisk(tb.hazard.fit_hazard(missions, workspace), workspace)
+        >>> draws = risk.draw(100)  # failure probabilities, leading axis (draw,)
     """
 
     exposures = OldName("trials")

@@ -31,7 +31,16 @@ _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
 
 
 class NoPathError(TrustboError, nx.NetworkXNoPath):
-    """The goal cannot be reached from the start."""
+    """The goal cannot be reached from the start.
+
+    Example:
+        >>> passable = np.array([[True, False, True]])
+        >>> split = tb.Workspace.from_awareness(np.full((3, 1, 3, 2), 0.5), passable)
+        >>> try:
+        ...     tb.Planner(split, (0, 0), (0, 2))
+        ... except tb.NoPathError as error:
+        ...     print(error)
+    """
 
 
 class AdmissiblePaths:

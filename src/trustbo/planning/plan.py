@@ -45,6 +45,12 @@ class Plan(Summary):
             `Campaign.replan`.
         value_band: Ends of the 90 % band of the value over the draws, with the mean failure
             probability; None with one draw. `value` limits trust to 1 and may lie outside.
+
+    Example:
+        >>> plan = tb.Planner(workspace, (9, 0), (0, 9)).plan(posterior)
+        >>> plan.path[0], plan.path[-1], plan.exact
+        ((9, 0), (0, 9), True)
+        >>> plan.trust.mean(axis=0)  # of each robot
     """
 
     path: tuple[Cell, ...]

@@ -19,6 +19,8 @@ from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.recursion import Recursion
 
+__all__ = ["explore", "greedy", "optimistic", "random", "thompson", "ucb"]
+
 Policy = Callable[..., Plan]
 """Function of a random generator, draws with leading axis (draw,) and a planner; returns a plan."""
 
@@ -30,13 +32,23 @@ _N_DRIFTS = 1000  # number of draws whose quantiles `optimistic` computes
 
 
 def greedy(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
-    """Plan the best path under the posterior mean of the parameters, as in the paper."""
+    """Plan the best path under the posterior mean of the parameters, as in the paper.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> plan = tb.planning.policies.greedy(rng, params, planner)
+    """
     _require(rng, params, planner)
     return planner.plan(params.mean())
 
 
 def thompson(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
-    """Plan the best path under one random posterior draw (probability matching)."""
+    """Plan the best path under one random posterior draw (probability matching).
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> plan = tb.planning.policies.thompson(rng, params, planner)
+    """
     _require(rng, params, planner)
     plan = planner.plan(params.draw(int(rng.integers(params.leading[0]))))
     return planner.evaluate(plan.path, params.mean())
@@ -48,6 +60,10 @@ def optimistic(
     """Plan the best path for optimistic drifts.
 
     The drift u of each bound is a high quantile over the draws; other parameters are means.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> plan = tb.planning.policies.optimistic(rng, params, planner, quantile=0.95)
     """
     _require(rng, params, planner)
     require_share("quantile", quantile)
@@ -64,7 +80,12 @@ def optimistic(
 
 
 def ucb(rng: np.random.Generator, params: Draws, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """Choose, among the draws' best paths, that with the largest mean + `kappa` sd of the value."""
+    """Choose, among the draws' best paths, that with the largest mean + `kappa` sd of the value.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> plan = tb.planning.policies.ucb(rng, params, planner, kappa=2.0)
+    """
     _require(rng, params, planner)
     require_finite("kappa", kappa)
 
@@ -94,6 +115,11 @@ def explore(
         driven: Paths of all missions, in order.
         regret: Acceptable regret of the plan, as a fraction; see `DrawnPaths.relative_regret`.
         doubt: Acceptable probability of a larger regret.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> driven = [mission.path for mission in missions]
+        >>> plan = tb.planning.policies.explore(rng, params, planner, driven=driven)
     """
     plan = greedy(rng, params, planner)
     require_share("regret", regret)
@@ -110,7 +136,12 @@ def explore(
 
 
 def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
-    """Plan the best path for random drifts, uniform on [0, 1], without using the posterior."""
+    """Plan the best path for random drifts, uniform on [0, 1], without using the posterior.
+
+    Example:
+        >>> rng = np.random.default_rng(0)
+        >>> plan = tb.planning.policies.random(rng, params, planner)
+    """
     _require(rng, params, planner)
 
     recursion = Recursion(

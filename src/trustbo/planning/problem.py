@@ -37,6 +37,15 @@ class InfeasibleError(TrustboError):
     Attributes:
         path: The safest admissible path.
         p_fail: Failure probability of the safest path.
+
+    Example:
+        >>> unsafe = np.full((8, 10, 10), 0.5)  # (move, row, col)
+        >>> planner = tb.Planner(workspace, (9, 0), (0, 9), max_failure=0.1).with_risk(unsafe)
+        >>> try:
+        ...     planner.plan(params.mean())
+        ... except tb.planning.InfeasibleError as error:
+        ...     print(len(error.path) - 1, "bounds")
+        9 bounds
     """
 
     def __init__(self, message: str, path: tuple[Cell, ...], p_fail: float) -> None:

@@ -143,6 +143,10 @@ def expected_trust(
     Raises:
         TrustboError: If the number of robots or features does not match the parameters, the path
             has another length, or there are place effects and no path is given.
+
+    Example:
+        >>> awareness = workspace.along(path)
+        >>> tb.planning.expected_trust(params, awareness, path=path).mean(axis=0)  # (bound, robot)
     """
     require_kind("params", params, Draws, "give parameters, such as TrustParams(...)")
     params.require_valid()

@@ -28,6 +28,8 @@ from trustbo.planning.problem import InfeasibleError, Problem, mean_and_draws_of
 from trustbo.planning.recursion import Recursion, states_along
 from trustbo.workspace.moves import cells_ahead
 
+__all__ = ["plan"]
+
 
 def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
     """Find the best admissible path for given parameters, or for the mean of a posterior.
