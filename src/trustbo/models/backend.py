@@ -107,5 +107,6 @@ def own_settings() -> Iterator[None]:
         jax.threefry_partitionable(True),
         jax.numpy_rank_promotion("allow"),
         jax.numpy_dtype_promotion("standard"),
+        jax.transfer_guard("allow"),
     ):
         yield
