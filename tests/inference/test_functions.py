@@ -1,6 +1,7 @@
 """Models that are NumPyro functions: what they compute, how they are fitted, what is refused."""
 
 import functools
+import os
 import subprocess
 import sys
 
@@ -384,6 +385,34 @@ def named_draw(awareness, rates):
     numpyro.sample("contact_rate", ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1), obs=rates)
 
 
+def with_parameter(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    b = numpyro.param("b", 0.3)
+    drift = a + b * awareness[..., 0]
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
+
+
+def improper(awareness, rates):
+    a = numpyro.sample("a", dist.ImproperUniform(dist.constraints.positive, (), ()))
+    numpyro.sample("contact_rate", ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1), obs=rates)
+
+
+def masked(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    given = ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1).mask(np.zeros(len(awareness), bool))
+    numpyro.sample("contact_rate", given, obs=rates)
+
+
+@jax.jit
+def jitted_part(z):
+    return z + numpyro.sample("a", dist.Normal())
+
+
+def with_jit(awareness, rates):
+    drift = jitted_part(awareness[..., 0])
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
+
+
 def without_variables(awareness, rates):
     numpyro.sample("contact_rate", ContactRate(awareness[..., 0], 0.5, 0.1, 0.1), obs=rates)
 
@@ -401,6 +430,11 @@ def broken(awareness, rates):
         (refused(unobserved), "is not observed; pass obs=contact_rate"),
         (refused(named_draw), "has the name of an axis"),
         (refused(discrete), "the site 'a' .* is discrete"),
+        (refused(with_parameter), "the site 'b' .* is a parameter .* use numpyro.sample"),
+        (refused(improper), "failed with NotImplementedError: .* proper priors"),
+        (refused(masked), "has a ContactRate that was changed by expand, mask"),
+        (refused(with_jit), "the site 'a' in its first run only; remove jax.jit"),
+        (jax.jit(linear), "in its first run only; remove jax.jit"),
         (refused(without_variables), "has no latent variable"),
         (refused(broken), "failed with RuntimeError: no such luck"),
         (
@@ -553,6 +587,17 @@ def scaled(scale):
     return model
 
 
+def test_a_guard_against_transfers_does_not_stop_a_function(missions):
+    model = as_model(linear)
+    data = data_of(missions, Observations.from_missions(missions))
+    with own_settings():
+        keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), 2)))
+
+    with jax.transfer_guard("disallow"):
+        drawn = model.over_draws("prior", 1, data)(keys)
+    assert drawn["weight"].shape == (2, 2)
+
+
 def test_a_fingerprint_tells_functions_apart_but_not_their_comments():
     assert fingerprint(scaled(1.0)) == fingerprint(scaled(1.0))
     assert fingerprint(scaled(1.0)) != fingerprint(scaled(2.0))
@@ -642,6 +687,30 @@ def test_a_fingerprint_without_source_is_the_same_in_other_processes():
     )
     run = [subprocess.run([sys.executable, "-c", script], capture_output=True) for _ in range(2)]
     assert run[0].stdout == run[1].stdout != b""
+
+
+def test_a_fingerprint_of_sets_is_the_same_in_other_processes():
+    script = (
+        "from types import SimpleNamespace\n"
+        "from trustbo.inference.functions.function import fingerprint as f\n"
+        "names = {'slope', 'openness', 'roughness', 'sight'}\n"
+        "settings = SimpleNamespace(names=names)\n"
+        "def closed(v): return lambda awareness, contact_rate=None: v\n"
+        "literal = lambda awareness, contact_rate=None: awareness in {'slope', 'tri', 'sight'}\n"
+        "print(f(closed(names)), f(closed(settings)), f(literal), f(closed({*names, 'tri'})))"
+    )
+    command = [sys.executable, "-c", script]
+    spaces = [os.environ | {"PYTHONHASHSEED": seed} for seed in ("1", "2")]
+    run = [subprocess.run(command, capture_output=True, env=space) for space in spaces]
+    assert run[0].stdout == run[1].stdout
+    assert len({*run[0].stdout.split()}) == 4
+
+
+def test_a_fingerprint_tells_random_keys_apart():
+    keys = [jax.random.key(0), jax.random.key(1)]
+    assert fingerprint(closed(keys[0])) != fingerprint(closed(keys[1]))
+    seeded = [numpyro.handlers.seed(first_wrapped, key) for key in keys]
+    assert fingerprint(seeded[0]) != fingerprint(seeded[1])
 
 
 def test_log_priors_of_missions_leave_out_the_padding(missions):

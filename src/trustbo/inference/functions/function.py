@@ -4,6 +4,7 @@ import ast
 import functools
 import hashlib
 import inspect
+import io
 import json
 import pickle
 import re
@@ -50,6 +51,8 @@ _AXES = ("chain", "draw")
 """Names that no variable may have."""
 _OF_SHAPES = re.compile("ncompatible shapes|could not be broadcast|not broadcast")
 """Errors of JAX and NumPy about shapes that do not fit each other."""
+_MODULE = "$params"
+"""Suffix of the site with the initial weights of a neural network in `numpyro.contrib.module`."""
 _FROM_REPARAM = ("_decentered", "_base")
 """Suffixes of the latent variable to which a reparametrisation of NumPyro moves the plates."""
 _HASH_LENGTH = 16
@@ -107,6 +110,7 @@ class FunctionModel:
         self.compiled: dict[tuple[str, tuple[str, ...]], Callable[..., Any]] = {}
         self.sampler: Any = None
         self._in_range: set[tuple[str, ...]] = set()  # features that were checked
+        self._runs_again = False  # whether it was checked that every run has all sites
 
     @property
     def family(self) -> str:
@@ -194,9 +198,11 @@ class FunctionModel:
         trace: dict[str, Any] = {}
 
         def run(key: jax.Array, arrays: dict[str, Any]) -> dict[str, Any]:
-            found = handlers.trace(handlers.seed(self.call, key)).get_trace({**data, **arrays})
+            inputs = {**data, **arrays}
+            found = handlers.trace(handlers.seed(self.call, key)).get_trace(inputs)
             trace.update(found)
             self._require_rates(found, data)
+            self._require_sites_again(found, key, inputs)
             return {
                 name: biject_to(found[name]["fn"].support).inv(found[name]["value"])
                 for name in _latent(found)
@@ -208,6 +214,23 @@ class FunctionModel:
                 arrays = {}
             free = jax.eval_shape(run, jax.random.key(0), arrays)
         return trace, free
+
+    def _require_sites_again(self, found: Mapping[str, Any], key: jax.Array, data: Data) -> None:
+        """Raise TrustboError if a second run lacks sites of the first one.
+
+        `jax.jit` does not run a function again that it has compiled, so NumPyro misses its sites.
+        """
+        if self._runs_again:
+            return
+
+        again = handlers.trace(handlers.seed(self.call, key)).get_trace(data)
+        lost = [name for name in found if name not in again]
+        if lost:
+            raise TrustboError(
+                f"{self.in_short()} has the site {lost[0]!r} in its first run only; remove jax.jit "
+                "from functions that call numpyro.sample. The model is compiled as a whole."
+            )
+        self._runs_again = True
 
     def _require_features_in_range(self, data: Data) -> None:
         """Raise TrustboError if the function reads a feature that awareness does not have.
@@ -249,14 +272,7 @@ class FunctionModel:
             sites = f"only {joined(names)}" if names else "no site at all"
             raise TrustboError(f"{self.in_short()} has no site 'contact_rate', {sites}. {_HOW}")
 
-        rates = site["fn"]
-        if not isinstance(rates, ContactRate):
-            while isinstance(rates, ExpandedDistribution | Independent | MaskedDistribution):
-                rates = rates.base_dist
-            raise TrustboError(
-                f"the site 'contact_rate' of {self.in_short()} has the distribution "
-                f"{type(rates).__name__}; it must be tb.models.ContactRate. {_HOW}"
-            )
+        rates = self._require_contact_rate(site["fn"])
         if not site["is_observed"]:
             raise TrustboError(
                 f"the site 'contact_rate' of {self.in_short()} is not observed; pass "
@@ -275,6 +291,29 @@ class FunctionModel:
                 f"{np.shape(data['awareness'])}; got {given}.{remedy}"
             )
 
+        self._require_variables(trace)
+
+    def _require_contact_rate(self, rates: Any) -> ContactRate:
+        """Return the distribution of the rates; raises TrustboError unless it is a ContactRate."""
+        if isinstance(rates, ContactRate):
+            return rates
+
+        where = f"the site 'contact_rate' of {self.in_short()}"
+        while isinstance(rates, ExpandedDistribution | Independent | MaskedDistribution):
+            rates = rates.base_dist
+        if isinstance(rates, ContactRate):
+            raise TrustboError(
+                f"{where} has a ContactRate that was changed by expand, mask or to_event; give a "
+                "drift of the shape (mission, bound, robot), and NaN for rates that are to be left "
+                "out."
+            )
+        raise TrustboError(
+            f"{where} has the distribution {type(rates).__name__}; it must be "
+            f"tb.models.ContactRate. {_HOW}"
+        )
+
+    def _require_variables(self, trace: Mapping[str, Any]) -> None:
+        """Raise TrustboError for sites of a kind or a name that a posterior cannot have."""
         for name, one in trace.items():
             free = one["type"] == "sample" and not one["is_observed"]
             named = free or one["type"] == "deterministic"
@@ -287,6 +326,12 @@ class FunctionModel:
                 raise TrustboError(
                     f"the site {name!r} of {self.in_short()} has the name of an axis of "
                     "posteriors; give it another name."
+                )
+            if one["type"] == "param" and not _has_prior(name, trace):
+                raise TrustboError(
+                    f"the site {name!r} of {self.in_short()} is a parameter to optimise "
+                    "(numpyro.param, flax_module), which NUTS leaves at its initial value; use "
+                    "numpyro.sample or random_flax_module."
                 )
 
     # --- functions that are compiled once for each shape of their arguments ---
@@ -426,6 +471,8 @@ class _explained:  # noqa: N801
         elif isinstance(error, Exception):
             text = (str(error).strip().splitlines() or [""])[0]
             remedy = ""
+            if isinstance(error, NotImplementedError):
+                remedy = " Give variables proper priors, from which NumPyro can draw."
             if _OF_SHAPES.search(text):
                 remedy = (
                     f" Awareness has the shape (mission, bound, robot, feature) = "
@@ -545,6 +592,15 @@ def _latent(trace: Mapping[str, Any]) -> list[str]:
     return [
         name for name, site in trace.items() if site["type"] == "sample" and not site["is_observed"]
     ]
+
+
+def _has_prior(name: str, trace: Mapping[str, Any]) -> bool:
+    """Return whether a parameter holds the initial weights of a network whose weights are sampled.
+
+    This is the case for `numpyro.contrib.module.random_flax_module` and its like.
+    """
+    network = name.removesuffix(_MODULE)
+    return network != name and any(one.startswith(f"{network}/") for one in _latent(trace))
 
 
 def _site(site: Mapping[str, Any], free: Any, plates: set[str]) -> Site:
@@ -715,7 +771,8 @@ def _describe(value: Any, parts: list[str], seen: dict[int, int]) -> None:
         for one in (value.func, value.args, value.keywords):
             _describe(one, parts, seen)
     elif isinstance(value, np.ndarray | jax.Array):
-        array = np.asarray(value)
+        is_key = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
+        array = np.asarray(jax.random.key_data(value) if is_key else value)
         parts.append(f"{array.dtype} {array.shape} {hashlib.sha256(array.tobytes()).hexdigest()}")
     elif isinstance(value, list | tuple | dict):
         _describe_items(value, parts, seen)
@@ -805,14 +862,37 @@ def _describe_other(value: Any, parts: list[str], seen: dict[int, int]) -> None:
 
     Pickle refers to the class of an object by name, so the code of `__call__` is added.
     """
+    content = io.BytesIO()
     try:  # the text must be the same in other processes
-        parts.append(hashlib.sha256(pickle.dumps(value, protocol=4)).hexdigest())
+        _Pickler(content, protocol=4).dump(value)
+        parts.append(hashlib.sha256(content.getvalue()).hexdigest())
     except Exception:
         parts.append(_kind_of(value))
 
     call = getattr(type(value), "__call__", None)  # noqa: B004
     if inspect.isfunction(call):
         _describe(call, parts, seen)
+
+
+class _Pickler(pickle.Pickler):
+    """Pickler that stores sets in the order of their items' texts.
+
+    The order of texts in a set differs between processes.
+    """
+
+    def persistent_id(self, value: Any) -> Any:
+        """Return what stands for a set; None for other values."""
+        return _sorted_texts(value) if isinstance(value, set | frozenset) else None
+
+
+def _sorted_texts(items: set[Any] | frozenset[Any]) -> list[str]:
+    """Return the texts of the items of a set, sorted; see `_describe`."""
+    texts = []
+    for one in items:
+        parts: list[str] = []
+        _describe(one, parts, {})
+        texts.append("\n".join(parts))
+    return sorted(texts)
 
 
 def _code_of(function: Callable[..., Any]) -> str:
@@ -831,10 +911,19 @@ def _code_of(function: Callable[..., Any]) -> str:
 
 def _byte_code_of(code: CodeType) -> str:
     """Return a byte code as text, the same in other processes."""
-    constants = [
-        _byte_code_of(one) if isinstance(one, CodeType) else repr(one) for one in code.co_consts
-    ]
+    constants = [_constant(one) for one in code.co_consts]
     return f"{code.co_code.hex()} {constants} {code.co_names!r}"
+
+
+def _constant(value: Any) -> str:
+    """Return a constant of a byte code as text, the same in other processes."""
+    if isinstance(value, CodeType):
+        return _byte_code_of(value)
+    if isinstance(value, tuple):
+        return f"({', '.join(map(_constant, value))})"
+    if isinstance(value, frozenset):
+        return f"{{{', '.join(sorted(map(_constant, value)))}}}"
+    return repr(value)
 
 
 def _content(cell: Any) -> Any:
