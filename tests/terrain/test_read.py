@@ -224,6 +224,57 @@ def test_pictures_are_refused_and_several_bands_are_warned_of(tmp_path):
         assert_is_the_plane(read_terrain(two, two))
 
 
+def test_a_band_is_found_by_its_name_in_files_and_arrays(tmp_path):
+    path = write(tmp_path / "both.tif", plane() + 9.0, plane())
+    with rasterio.open(path, "r+") as file:
+        file.descriptions = "DSM", "ground (DTM)"
+        file.scales = 1.0, 0.9
+    with pytest.warns(UserWarning, match="Scales differ"):
+        from_rioxarray = rioxarray.open_rasterio(path)
+    labelled = xr.concat([array(plane()), array(plane() + 9.0)], "band")
+    labelled = labelled.assign_coords(band=["dem", "dsm"])[::-1]
+
+    for raster, scale in ((path, 0.9), (from_rioxarray, 0.9), (labelled, 1.0)):
+        with pytest.warns(UserWarning, match="2 bands"):
+            terrain = read_terrain(raster, raster)
+        np.testing.assert_allclose(terrain["dem"], scale * plane(dtype=float))
+        np.testing.assert_allclose(terrain["dsm"], plane() + 9.0)
+
+
+def test_attributes_of_all_bands_are_those_of_the_chosen_band(tmp_path):
+    path = write(tmp_path / "feet.tif", plane(), 10.0 * plane())
+    with rasterio.open(path, "r+") as file:
+        file.scales = 1.0, 0.1
+        file.units = "ft", "m"
+    with pytest.warns(UserWarning, match="Scales differ"):
+        chosen = rioxarray.open_rasterio(path).sel(band=2)
+    np.testing.assert_allclose(read_terrain(chosen, chosen)["dem"], plane(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("fill", [-99.99, 6553.5])
+def test_fills_that_arithmetic_turned_into_heights_are_warned_of(fill):
+    holed = plane(dtype=float)
+    holed[:2, :2] = fill
+    with pytest.warns(UserWarning, match="within 10"):
+        read_terrain(array(holed), array(holed))
+    terrain = read_terrain(array(holed), array(holed), nodata=fill)  # warnings are errors
+    assert int(terrain["dem"].isnull().sum()) == 4
+
+    flat_roof = plane(dtype=float)
+    flat_roof[:2, :2] = 150.0
+    read_terrain(array(plane()), array(flat_roof))
+
+
+def test_heights_that_were_scaled_before_are_warned_of(tmp_path):
+    path = write(tmp_path / "packed.tif", (10.0 * plane() + 1.0).astype("int16"), scale=(0.1, 0.0))
+    packed = rioxarray.open_rasterio(path, masked=True)
+    np.testing.assert_allclose(read_terrain(packed, packed)["dem"], plane() + 0.1)
+
+    scaled = (packed * 0.1).assign_attrs(packed.attrs)
+    with pytest.warns(UserWarning, match="scale 0.1"):
+        read_terrain(scaled, scaled)
+
+
 def test_heights_in_feet_become_metres_with_a_warning(tmp_path):
     stored = 33.0 * plane(np.nan, float)  # to 3600 feet: no fill value
     for unit, crs, metres in (

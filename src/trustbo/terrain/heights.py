@@ -19,6 +19,7 @@ ACCESSOR_FILL = "rio.nodata"
 """Attribute that carries the fill value of rioxarray's accessor, which most operations drop."""
 _FILL_NAMES = ("_FillValue", "missing_value", "fill_value", "nodata", ACCESSOR_FILL)
 _LOW = 10.0  # m; heights on one level with zeros
+_FAR = 100.0  # m; distance of the highest height from all others that is unlikely
 _METRE = {"m", "metre", "metres", "meter", "meters"}
 _FOOT = {"ft", "foot", "feet", "ftus", "usft"}
 _OTHER_UNIT = 0.5  # share of impossible heights from which another unit is the likely cause
@@ -66,6 +67,9 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
     wrong = ~missing & (suspicious | (heights < LOWEST) | (heights > HIGHEST))
     if not wrong.any():
         _warn_of_zeros(heights, name)
+        _warn_of_levels(heights, raw, name)
+        if scale != 1.0:
+            _warn_of_second_scale(values[~missing], scale, name)
         return heights
 
     r, c = np.unravel_index(np.argmax(wrong), wrong.shape)
@@ -125,6 +129,41 @@ def _warn_of_zeros(heights: np.ndarray, name: str) -> None:
             f"{name} is exactly 0 m on {n_zero / heights.size:.1%} of its pixels, but hardly any "
             f"other height is below {_LOW:g} m: zeros may be missing heights; pass nodata=0 if "
             "they are."
+        )
+
+
+def _warn_of_levels(heights: np.ndarray, raw: np.ndarray, name: str) -> None:
+    """Warn if several pixels share the lowest or the highest height, far from all others.
+
+    Arithmetic turns fill values into heights: -9999 cm are -99.99 m, and 65535 dm are 6553.5 m.
+    Roofs share a height, too, so the highest must be further away. `raw` holds the stored values.
+    """
+    lowest = np.fmin.reduce(heights, axis=None)
+    highest = np.fmax.reduce(heights, axis=None)
+    for level, gap in ((lowest, _LOW), (highest, _FAR)):
+        is_level = heights == level
+        others = heights[np.isfinite(heights) & ~is_level]
+        if level == 0.0 or not 2 <= is_level.sum() < len(others):
+            continue
+
+        if np.abs(others - level).min() > gap and others.min() < others.max():
+            warn(
+                f"{name} is exactly {level:g} m on {is_level.mean():.1%} of its pixels, but no "
+                f"other height is within {gap:g} m: they may be missing heights that were scaled "
+                f"or shifted; pass nodata={float(raw[is_level][0])!r} if they are."
+            )
+
+
+def _warn_of_second_scale(values: np.ndarray, scale: float, name: str) -> None:
+    """Warn of stored values that are not whole, as values that were scaled before are.
+
+    Values are stored with a scale to save space, as whole numbers.
+    """
+    if (values != np.round(values)).mean() > 0.5:
+        warn(
+            f"{name} declares the scale {scale:g}, which is applied, but its values are not whole "
+            "numbers: if they were scaled before, remove the attribute, e.g. "
+            "del array.attrs['scale_factor'] (xarray keeps attributes in arithmetic)."
         )
 
 

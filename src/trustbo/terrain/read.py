@@ -5,8 +5,9 @@ NaN where missing, on a metric grid with north at the top.
 """
 
 import math
+import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from os import PathLike
 from os.path import expanduser, isdir
@@ -43,6 +44,10 @@ _COARSER = 2.0  # ratio of pixel sizes from which the coarser raster smooths the
 _TILES = "to read tiles as one raster, combine them: gdalbuildvrt -srcnodata -9999 all.vrt *.tif"
 _ROUNDING = 1e-3  # of a pixel: smaller errors of a grid are rounding
 _EXACT = 1e-6  # of a pixel: smaller errors of coordinates are left as they are
+_BANDS = {"dem": {"dem", "dtm", "elevation"}, "dsm": {"dsm", "surface"}}
+"""Words by which a band of heights is known."""
+_OF_BANDS = {"scales": "scale_factor", "offsets": "add_offset", "units": "units"}
+"""Attributes with one entry for each band, and the attribute of one band."""
 _TALL = 60.0  # m: a higher median of the canopy height is unlikely
 _RAISED = 20.0  # m: a higher 5 % quantile of the canopy height is unlikely
 
@@ -65,9 +70,10 @@ def read_terrain(
 
     Args:
         dem: Heights: the path or address of a raster that GDAL reads (`/vsizip/...`,
-            `https://...`), or a DataArray with coordinates and a CRS set by rioxarray. The first
-            band is read. NaN, infinity, nodata values and pixels hidden by a mask or an alpha band
-            are missing; scale and offset are applied.
+            `https://...`), or a DataArray with coordinates and a CRS set by rioxarray. Of several
+            bands, the one named "dem", "dtm" or "elevation" is read ("dsm" or "surface" for `dsm`),
+            or else the first. NaN, infinity, nodata values and pixels hidden by a mask or an alpha
+            band are missing; scale and offset are applied.
         dsm: Heights of the surface, in the same forms, on any grid that overlaps the DEM's. If it
             is omitted, the ground is used as the surface, and a warning is issued.
         crs: Coordinate reference system of rasters without one, e.g. `"EPSG:32633"`.
@@ -198,14 +204,14 @@ def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
 
     quiet = warnings.catch_warnings(action="ignore", category=NotGeoreferencedWarning)
     with _reading(name), quiet, rasterio.open(path) as file:
-        return _of_array(_of_file(file, name), name)
+        return _of_array(_of_file(file, role, name), role, name)
 
 
 def _stored_array(raster: xr.DataArray, role: str) -> xr.DataArray:
     """Read stored values of an array, dims (y, x), named after `role` in messages."""
     name = f"{role}: DataArray" + (f" {raster.name!r}" if raster.name else "")
     with _reading(name):
-        return _of_array(raster, name).compute()  # reads the file of a lazy array
+        return _of_array(raster, role, name).compute()  # reads the file of a lazy array
 
 
 @contextmanager
@@ -224,8 +230,8 @@ def _reading(name: str) -> Iterator[None]:
         raise TrustboError(f"{name} cannot be read by GDAL: {message}.") from None
 
 
-def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
-    """Read the first band of a GDAL dataset, NaN where a mask or an alpha band hides a pixel.
+def _of_file(file: DatasetReader, role: str, name: str) -> xr.DataArray:
+    """Read the band of heights of a GDAL dataset, NaN where a mask or an alpha band hides a pixel.
 
     With a mask or an alpha band, GDAL's own mask ignores the nodata tag, so the tag is added to the
     declared fill values.
@@ -246,25 +252,27 @@ def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
             "gdal_edit.py -a_ullr."
         )
 
-    first, *others = file.colorinterp
-    if first not in (ColorInterp.undefined, ColorInterp.gray):
-        raise TrustboError(
-            f"{name} is a picture: its first band has the colour {first.name!r}; give a raster of "
-            "heights, e.g. one of its bands, extracted with gdal_translate -b."
-        )
+    alpha = [k for k, colour in enumerate(file.colorinterp) if colour == ColorInterp.alpha]
+    opaque = [text or "" for k, text in enumerate(file.descriptions) if k not in alpha or k == 0]
+    band = _band_of_heights(opaque, role)
 
-    stored = file.read(1, masked=True)
+    colour = file.colorinterp[band]
+    if colour not in (ColorInterp.undefined, ColorInterp.gray):
+        raise TrustboError(
+            f"{name} is a picture: its band {band + 1} has the colour {colour.name!r}; give a "
+            "raster of heights, e.g. one of its bands, extracted with gdal_translate -b."
+        )
+    _warn_of_bands(opaque, band, name)
+
+    stored = file.read(band + 1, masked=True)
     values = stored.astype(np.result_type(stored, np.float32)).filled(np.nan)
 
-    alpha = [k for k, colour in enumerate(others, 2) if colour == ColorInterp.alpha]
     for k in alpha:  # GDAL's mask ignores alpha bands of floats
-        values[file.read(k) == 0] = np.nan
-
-    _warn_of_bands(file.count - len(alpha), name)
+        values[file.read(k + 1) == 0] = np.nan
 
     attrs = {
-        "_FillValue": file.nodata, "scale_factor": file.scales[0], "add_offset": file.offsets[0],
-        "units": file.units[0],
+        "_FillValue": file.nodata, "scale_factor": file.scales[band],
+        "add_offset": file.offsets[band], "units": file.units[band],
     }  # fmt: skip
     rows = np.arange(file.height) + 0.5
     cols = np.arange(file.width) + 0.5
@@ -274,13 +282,58 @@ def _of_file(file: DatasetReader, name: str) -> xr.DataArray:
     return array if file.crs is None else array.rio.write_crs(file.crs)
 
 
-def _warn_of_bands(n: int, name: str) -> None:
-    if n > 1:
-        warn(f"{name} has {n} bands; the first one is used as heights.")
+def _band_of_heights(names: Sequence[str], role: str) -> int:
+    """Return the index of the band whose name says that it has the heights of a role, or else 0.
+
+    Args:
+        names: Names of the bands, "" for bands without one.
+        role: "dem" or "dsm".
+    """
+    words = [set(re.findall("[a-z]+", name.lower())) for name in names]
+    named = [k for k, of_band in enumerate(words) if of_band & _BANDS[role]]
+    return named[0] if len(named) == 1 else 0
 
 
-def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
-    """Reduce an array to dims (y, x), evenly spaced, and to the first of several bands."""
+def _warn_of_bands(names: Sequence[str], band: int, name: str) -> None:
+    if len(names) > 1:
+        listed = f" ({', '.join(text or 'unnamed' for text in names)})" if any(names) else ""
+        warn(
+            f"{name} has {len(names)} bands{listed}; band {band + 1} is used as heights. To use "
+            "another one, give a DataArray, e.g. rioxarray.open_rasterio(file).sel(band=2)."
+        )
+
+
+def _band_names(array: xr.DataArray, dim: Hashable) -> list[str]:
+    """Return the names of an array's bands: its labels, or descriptions as from rioxarray."""
+    labels = array[dim].values.tolist()
+    if all(isinstance(label, str) for label in labels):
+        return labels
+
+    descriptions = array.attrs.get("long_name")
+    if isinstance(descriptions, tuple | list) and len(descriptions) == len(labels):
+        return [text or "" for text in descriptions]
+    return [""] * len(labels)
+
+
+def _attrs_of_band(array: xr.DataArray) -> dict[Any, Any]:
+    """Return the attributes of one band of an array; rioxarray has tuples of all bands.
+
+    The band is that of the coordinate `band`, which counts from 1 and remains after `sel`.
+    """
+    number = array.coords.get("band")
+    is_known = number is not None and number.ndim == 0 and number.dtype.kind in "iu"
+    band = int(number) - 1 if number is not None and is_known else 0
+
+    attrs = dict(array.attrs)
+    for several, one in _OF_BANDS.items():
+        values = attrs.get(several)
+        if isinstance(values, tuple | list) and band < len(values):
+            attrs[one] = values[band]
+    return attrs
+
+
+def _of_array(array: xr.DataArray, role: str, name: str) -> xr.DataArray:
+    """Reduce an array to dims (y, x), evenly spaced, and to the band of heights."""
     check_size(array.shape, name)
 
     # The operations below drop rioxarray's accessor, and with it what its methods have set.
@@ -298,11 +351,16 @@ def _of_array(array: xr.DataArray, name: str) -> xr.DataArray:
     if not {y, x} <= set(array.dims) & set(array.coords) or len(bands) > 1 or not array.size:
         raise TrustboError(
             f"{name} has axes {dict(array.sizes)}; it needs rows and columns, named (y, x), with "
-            "coordinates, and at most one axis of bands."
+            "coordinates, and at most one axis of bands. A rotated grid has no such coordinates; "
+            "warp it, e.g. with array.rio.reproject."
         )
 
-    _warn_of_bands(max([array.sizes[dim] for dim in bands], default=1), name)
-    array = array.isel(dict.fromkeys(bands, 0)).transpose(y, x)
+    if bands:
+        names = _band_names(array, bands[0])
+        band = _band_of_heights(names, role)
+        _warn_of_bands(names, band, name)
+        array = array.isel({bands[0]: band})
+    array = array.transpose(y, x).assign_attrs(_attrs_of_band(array))
 
     rows, cols = (_even(array[axis].values, f"{name}'s {axis}") for axis in (y, x))
     if (unit := str(array[x].attrs.get("units")).lower()).startswith(("k", "f", "us", "rad")):
