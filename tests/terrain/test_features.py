@@ -191,13 +191,32 @@ def test_a_feature_of_one_s_own():
         values = pixel_features(falls_north, ["northness"])
         np.testing.assert_allclose(values["northness"][INSIDE], 1.0)
         with pytest.raises(TrustboError, match="northness"):
-            feature("northness", sign=1)
+            feature("northness", sign=1)(np.hypot)
     finally:
         del FEATURES["northness"]
     with pytest.raises(TrustboError, match="sign"):
         feature("other", sign=0)
     with pytest.raises(TrustboError, match="name"):
         feature(None, sign=1)
+
+
+def test_a_definition_of_a_feature_may_run_again():
+    def define(factor):
+        @feature("stones", sign=-1)
+        def stones(terrain):
+            return factor * terrain["dem"].values
+
+        return stones
+
+    try:
+        define(1.0)
+        again = define(2.0)
+        assert FEATURES["stones"].compute is again
+    finally:
+        del FEATURES["stones"]
+
+    with pytest.raises(TrustboError, match="slope"):
+        feature("slope", sign=-1)(lambda terrain: terrain["dem"].values)
 
 
 def test_a_hole_in_the_surface_leaves_the_means_around_it():

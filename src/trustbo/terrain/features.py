@@ -6,7 +6,7 @@ the example in `docs/terrain.md`.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -42,7 +42,11 @@ FEATURES: dict[str, Feature] = {}
 def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[F], F]:
     """Register a function as a feature of pixels under a new name (decorator).
 
-    Raises TrustboError if the name is no text or is taken, or the sign is neither 1 nor -1.
+    A function replaces an earlier one with the same name from the same module, so that a cell of a
+    notebook can be run again.
+
+    Raises TrustboError if the name is no text or is taken by another function, or the sign is
+    neither 1 nor -1.
 
     Example:
         >>> @tb.terrain.feature("bush", sign=-1)
@@ -52,16 +56,21 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
         >>> tb.Workspace.from_terrain(tb.terrain.example(), (4, 4), features=names)
     """
     require_kind("name of the feature", name, str, "give a text, such as 'stones'")
-    if name in FEATURES:
-        raise TrustboError(f"feature {name!r} already exists; choose another name.")
     if require_whole("sign", sign, -1) == 0 or sign > 1:
         raise TrustboError(f"sign must be 1 or -1; got {sign!r}.")
 
     def register(compute: F) -> F:
+        if name in FEATURES and _origin(FEATURES[name].compute) != _origin(compute):
+            raise TrustboError(f"feature {name!r} already exists; choose another name.")
         FEATURES[name] = Feature(compute, sign)
         return compute
 
     return register
+
+
+def _origin(function: Callable[..., Any]) -> tuple[object, ...]:
+    """Return the module and the name of a function, which stay when its definition runs again."""
+    return tuple(getattr(function, name, None) for name in ("__module__", "__qualname__"))
 
 
 def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
