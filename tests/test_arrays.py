@@ -147,6 +147,8 @@ def test_tables_that_cannot_hold_the_axes_are_refused():
         np.array(["2026-01-01"], "M8[D]"),
         np.array([3], "m8[s]"),
         [datetime.timedelta(seconds=3)],
+        pd.to_timedelta([3.0], unit="s"),
+        pd.Series(pd.to_timedelta([3.0], unit="s")),
         [[1.0], [1.0, 2.0]],
         10**400,
         {"a": 1.0},

@@ -59,6 +59,36 @@ def test_contact_rates_outside_the_unit_interval_are_named(value, shown):
         Mission.from_arrays(PATH, z, y)
 
 
+def test_values_that_rounding_moved_out_of_the_unit_interval_are_moved_back():
+    z, y = arrays()
+    z[0, 0] = [-1e-17, np.float32(1.0) + np.float32(1.2e-7)]
+    y[0, :2] = [1.0000000000000002, -1e-7]
+    mission = Mission.from_arrays(PATH, z, y, n_ticks=[[1, 5, 5], [5, 5, 5]])
+    np.testing.assert_array_equal(mission.contact_rate[0], [1.0, 0.0, 0.4])
+    np.testing.assert_array_equal(mission.awareness[0, 0], [0.0, 1.0])
+
+    y[0, 0] = 1.00001
+    with pytest.raises(TrustboError, match="outside"):
+        Mission.from_arrays(PATH, z, y)
+
+
+def test_no_ticks_without_a_rate_mean_that_nothing_was_measured():
+    z, y = arrays()
+    y[0, 1] = np.nan
+    mission = Mission.from_arrays(PATH, z, y, n_ticks=[[5, 0, 5], [5, 5, 5]])
+    np.testing.assert_array_equal(mission.n_ticks, [[5, np.nan, 5], [5, 5, 5]])
+    with pytest.raises(TrustboError, match="n_ticks"):
+        Mission.from_arrays(PATH, z, y, n_ticks=[[0, 0, 5], [5, 5, 5]])
+
+
+def test_one_name_may_be_composed_of_letters_and_accents():
+    team = Team(2, names=("\u00e9clair", "b"))
+    assert Team(2, names=("e\u0301clair", "b")).names == team.names
+    rates = pd.DataFrame([[0.1, 0.2], [0.3, 0.4]], columns=["b", "e\u0301clair"])
+    mission = Mission.from_arrays(PATH, np.full((2, 2, 2), 0.5), rates, robots=team.names)
+    np.testing.assert_array_equal(mission.contact_rate, [[0.2, 0.1], [0.4, 0.3]])
+
+
 def test_awareness_outside_the_unit_interval_is_named():
     z, y = arrays()
     z[0, 1, 1] = 2.0

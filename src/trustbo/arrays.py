@@ -14,7 +14,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.errors import TrustboError, one_line
+from trustbo.errors import TrustboError, composed, one_line
 
 _NUMERIC = "biufO"
 """Kinds of dtypes that may hold real numbers."""
@@ -26,6 +26,8 @@ _FIRST = {"bound": (0, 1), "row": (0,), "col": (0,)}
 """Numbers that the labels of an axis may begin with, of the axes that are numbered."""
 _LARGEST = 1e12
 """Largest size of a parameter; trust near 1 added to it keeps four digits."""
+_SHARE_ROUNDING = 1e-6
+"""Largest distance of a value from [0, 1] that is rounding, as of means in single precision."""
 _CHOSEN = ("robot", "feature")
 """Axes whose names the user chooses, or leaves out."""
 
@@ -152,6 +154,19 @@ def require_numbers(what: str, values: ArrayLike, *, missing: bool = False) -> n
     return array
 
 
+def without_rounding(values: np.ndarray) -> np.ndarray:
+    """Return values in which rounding has left [0, 1], such as 1.0000001, moved to 0 or 1.
+
+    Other values outside [0, 1] are unchanged.
+    """
+    outside = (values < 0.0) | (values > 1.0)
+    if not outside.any():
+        return values
+
+    nearest = np.clip(values, 0.0, 1.0)
+    return np.where(np.abs(values - nearest) <= _SHARE_ROUNDING, nearest, values)
+
+
 def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:
     """Return names as a tuple; raises TrustboError if one is not a string or is repeated.
 
@@ -166,7 +181,7 @@ def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:
     if len(set(names)) < len(names) or (names and n not in (None, len(names))):
         many = "" if n is None else f"{n} "
         raise TrustboError(f"{what} must be {many}different names; got {names}.")
-    return tuple(str(name) for name in names)  # NumPy's strings become Python's
+    return tuple(composed(str(name)) for name in names)  # NumPy's strings become Python's
 
 
 def default_robots(n_robots: int) -> Names:
@@ -176,9 +191,10 @@ def default_robots(n_robots: int) -> Names:
 
 def _with_nan(values: Any) -> Any:
     """Replace pandas' missing values, which NumPy does not know, with NaN."""
-    if isinstance(values, pd.DataFrame | pd.Series | pd.Index):
-        return values.to_numpy(dtype=object, na_value=np.nan)
-    return values
+    if not isinstance(values, pd.DataFrame | pd.Series | pd.Index):
+        return values
+    plain = values.to_numpy()
+    return plain if plain.dtype.kind in _TIMES else values.to_numpy(dtype=object, na_value=np.nan)
 
 
 def _as_dataarray(
@@ -241,7 +257,7 @@ def _axes_of(
         )
 
     if isinstance(table, pd.Series):
-        texts = {str(label) for label in table.index}
+        texts = {composed(str(label)) for label in table.index}
         usual = str(table.index.name) if table.index.name in dims else dims[0]
         named = (dim for dim in dims if texts == set(names.get(dim) or ()))
         return {next(named, usual): table.index}
@@ -262,7 +278,7 @@ def _by_name(what: str, dim: str, labels: list[Any], names: Names) -> tuple[list
     """Return the place of each name among the labels, and the names; no names if they count."""
     is_text = [isinstance(label, str) for label in labels]
     is_whole = [isinstance(label, Integral) and not isinstance(label, bool) for label in labels]
-    texts = [str(label) for label in labels]
+    texts = [composed(str(label)) for label in labels]
 
     if len(set(texts)) == len(texts) and set(texts) == set(names):
         return [texts.index(name) for name in names], names

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from trustbo.arrays import as_names, default_robots, read_labelled
+from trustbo.arrays import as_names, default_robots, read_labelled, without_rounding
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError, require_cells, require_choice, require_kind, require_whole
 
@@ -83,9 +83,11 @@ class Bound:
 
         mapped = self.cell != NOWHERE
         where = f"the bound into cell {self.cell}" if mapped else "a bound without a map"
-        require_unit_interval(f"contact_rate of {where}", self.contact_rate)
+        rates = require_unit_interval(f"contact_rate of {where}", self.contact_rate)
+        object.__setattr__(self, "contact_rate", rates)
         if mapped:
-            require_unit_interval(f"awareness of {where}", self.awareness)
+            z = require_unit_interval(f"awareness of {where}", self.awareness)
+            object.__setattr__(self, "awareness", z)
         elif np.isinf(self.awareness).any():
             raise TrustboError(f"awareness of {where} must be finite, or NaN where not measured.")
 
@@ -94,7 +96,8 @@ class Bound:
             i = np.flatnonzero(is_bad)[0]
             raise TrustboError(f"duration[{i}] = {self.duration[i]:g} s must be positive.")
 
-        require_shares(self.contact_rate, self.n_ticks)
+        ticks = require_shares(self.contact_rate, self.n_ticks)
+        object.__setattr__(self, "n_ticks", ticks)
 
     def __repr__(self) -> str:
         rates = ", ".join(f"{rate:.3f}" for rate in self.contact_rate)
@@ -448,11 +451,15 @@ def default_features(n_features: int) -> tuple[str, ...]:
     return (*FEATURES, *(f"z{m + 1}" for m in range(2, n_features)))[:n_features]
 
 
-def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
-    """Reject ticks that are not whole and rates that are not multiples of 1 / ticks."""
+def require_shares(rate: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+    """Return ticks, NaN where no tick and no rate was counted.
+
+    Raises TrustboError for ticks that are not whole and rates that are not multiples of 1 / ticks.
+    """
     if ticks.shape != rate.shape:
         raise TrustboError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
 
+    ticks = np.where((ticks == 0.0) & np.isnan(rate), np.nan, ticks)
     is_bad = (ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)
     if is_bad.any():
         i = np.flatnonzero(is_bad)[0]
@@ -465,16 +472,19 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> None:
             f"contact_rate[{i}] = {rate[i]:g} is not a multiple of 1 / {ticks[i]:g} (n_ticks); "
             "give all decimals, or leave n_ticks out."
         )
+    return ticks
 
 
-def require_unit_interval(what: str, values: np.ndarray) -> None:
-    """Raise TrustboError for values outside [0, 1]; NaN is allowed."""
+def require_unit_interval(what: str, values: np.ndarray) -> np.ndarray:
+    """Return values in [0, 1] or NaN, without rounding; raises TrustboError for values outside."""
+    values = without_rounding(values)
     bad = (values < 0.0) | (values > 1.0)
     if bad.any():
         index = ", ".join(str(i) for i in np.argwhere(bad)[0])
         scaled = "percent? divide by 100; rating from 1 to n? (rating - 1) / (n - 1)"
         hint = f" ({scaled})" if np.nanmin(values) >= 0.0 else ""
         raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{hint}.")
+    return values
 
 
 def _require_counted(path: Iterable[Cell]) -> None:

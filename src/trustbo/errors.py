@@ -5,6 +5,7 @@ import functools
 import inspect
 import math
 import operator
+import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -57,6 +58,8 @@ def warn(message: str) -> None:
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:
     """Return `value` if it is among `choices`; otherwise, raise a TrustboError that lists them."""
     choices = tuple(choices)
+    if isinstance(value, str) and composed(value) in choices:
+        return composed(value)
     if not isinstance(value, str) or value not in choices:
         raise TrustboError(f"unknown {what} {value!r}; choose one of {', '.join(choices)}.")
     return value
@@ -149,6 +152,14 @@ def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
     if not isinstance(value, kind):
         raise TrustboError(f"{what}: got {type(value).__name__} {one_line(value)}; {remedy}.")
     return value
+
+
+def composed(name: str) -> str:
+    """Return a name with composed letters (Unicode NFC).
+
+    An accented letter may be one character or two, as in names of files on macOS; both look alike.
+    """
+    return unicodedata.normalize("NFC", name)
 
 
 def see(page: str) -> str:

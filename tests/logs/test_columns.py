@@ -1,6 +1,7 @@
 """Columns of users' tables: what spreadsheets, surveys and other tools add, and clocks."""
 
 import gzip
+import io
 
 import numpy as np
 import pandas as pd
@@ -70,6 +71,7 @@ def test_frames_datasets_mappings_and_arrays_are_read(table):
         {"who": 7, "t": 0.5},
         xr.DataArray([7, 8]),
         ["first.csv", "second.csv"],
+        io.StringIO("who,t\n7,0.5\n"),
     ],
 )
 def test_values_that_are_no_table_are_refused(table):
@@ -112,6 +114,19 @@ def test_commas_that_may_separate_thousands_are_refused(tmp_path):
     np.testing.assert_array_equal(table.numbers("x"), [1.02, 0.98])
     with pytest.raises(TrustboError, match=r"row 1.*1,020"):
         table.numbers("t")
+
+
+def test_text_in_utf_16_and_open_files_are_named(tmp_path):
+    (tmp_path / "a.csv").write_text("who\tt\n7\t1\n", encoding="utf-16")
+    with pytest.raises(TrustboError, match="UTF-16"):
+        Columns(tmp_path / "a.csv")
+    with pytest.raises(TrustboError, match="open file"):
+        Columns(io.StringIO("who,t\n7,1\n"))
+
+
+def test_accents_are_composed():
+    table = Columns({"e\u0301tat": ["re\u0301ussi"]})
+    assert table.texts("\u00e9tat") == ["r\u00e9ussi"]
 
 
 def test_optional_columns_that_differ_only_in_case_are_refused():

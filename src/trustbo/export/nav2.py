@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.arrays import as_array
+from trustbo.arrays import as_array, without_rounding
 from trustbo.campaign.result import Result
 from trustbo.errors import (
     TrustboError,
@@ -229,6 +229,7 @@ def occupancy(
     cost: np.ndarray, workspace: Workspace, frame: Frame, pixel: float | None = None
 ) -> tuple[np.ndarray, list[float], float]:
     """Return pixels (row, col), southern row first, the lower left corner and the pixel size."""
+    cost = without_rounding(cost)
     if ((cost < 0.0) | (cost > 1.0)).any():
         raise TrustboError(
             f"cost must be in [0, 1]; got values from {np.nanmin(cost):g} to {np.nanmax(cost):g}."

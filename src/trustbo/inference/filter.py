@@ -205,12 +205,12 @@ class TrustFilter:
         y = self._of_robots("contact_rate", contact_rate)
         if y.shape != (self._n_robots,):
             raise TrustboError(f"contact_rate must have shape ({self._n_robots},); got {y.shape}.")
-        require_unit_interval("contact_rate", y)
+        y = require_unit_interval("contact_rate", y)
 
         ticks = self._of_robots("n_ticks", np.nan if n_ticks is None else n_ticks)
         if ticks.ndim == 0:
             ticks = np.full(y.shape, ticks)
-        require_shares(y, ticks)
+        ticks = require_shares(y, ticks)
         if self.likelihood.needs_ticks and (np.isnan(ticks) & ~np.isnan(y)).any():
             raise TrustboError(NO_TICKS)
 
@@ -321,7 +321,7 @@ class TrustFilter:
                 "workspace.along(path), with shape (bound, robot, feature)."
             )
         if self._bounded:
-            require_unit_interval("awareness", z)
+            return require_unit_interval("awareness", z)
         return z
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from trustbo.errors import TrustboError, one_line, see
+from trustbo.errors import TrustboError, composed, one_line, see
 from trustbo.files import FilePath, read_file
 
 _BLANK = ("", "na", "n/a", "#n/a", "#na", "nan", "nat", "none", "null", "<na>")
@@ -27,6 +27,7 @@ _OTHER_FILES = {
     b"PK\x03\x04": ("an Excel workbook or a zip archive", "pandas.read_excel(file)"),
     b"\xd0\xcf\x11\xe0": ("an Excel workbook", "pandas.read_excel(file)"),
     b"PAR1\x15": ("a Parquet file", "pandas.read_parquet(file)"),
+    b"\xff\xfe": ("text in UTF-16", 'pandas.read_csv(file, encoding="utf-16", sep="\\t")'),
 }
 """First bytes of files that are not CSV, what they are, and what reads them."""
 
@@ -69,7 +70,7 @@ class Columns:
         if any(names):
             frame = frame.drop(columns=[name for name in names if name in frame]).reset_index()
 
-        frame.columns = [str(name).strip() for name in frame.columns]
+        frame.columns = [composed(str(name).strip()) for name in frame.columns]
         frame = frame.loc[:, [not re.fullmatch(r"(Unnamed: \d+)?", n) for n in frame.columns]]
         if not frame.columns.is_unique:
             raise TrustboError(f"{what} repeats a column name: {', '.join(frame.columns)}.")
@@ -242,7 +243,7 @@ def folded(name: str) -> str:
 
 def _cell(value: object) -> str | None:
     """Return the text of a cell; None if it is blank."""
-    text = str(value).strip()
+    text = composed(str(value).strip())
     return None if text.lower() in _BLANK else text
 
 
@@ -257,6 +258,9 @@ def _decimals(cell: Any) -> int:
 
 def _of_value(table: Any, what: str) -> pd.DataFrame:
     """Convert a table in memory; xarray has `to_dataframe`, polars and pyarrow `to_pandas`."""
+    if hasattr(table, "read"):
+        raise TrustboError(f"{what} is an open file; give its path, or pandas.read_csv(file).")
+
     try:
         if not isinstance(table, pd.DataFrame):
             convert = getattr(table, "to_dataframe", None) or getattr(table, "to_pandas", None)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from trustbo.arrays import without_rounding
 from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_kind, require_list
 from trustbo.logs.columns import Columns, require_one_spelling
@@ -68,6 +69,7 @@ def read_reports(
     require_one_spelling(f"column {person}", people.tolist())
 
     given = columns.numbers(report, whole=levels > 0, hint=_WORDS)
+    given = given if levels else without_rounding(given)
     low = 1 if levels else 0
     high = levels or 1
     columns.refuse(

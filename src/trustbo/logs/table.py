@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from trustbo.arrays import without_rounding
 from trustbo.data import FEATURES, SHARE_TOLERANCE, Mission
 from trustbo.errors import TrustboError
 from trustbo.logs.columns import Columns, folded, require_one_spelling, require_plain_names
@@ -135,7 +136,8 @@ def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:
     for name in RATES:
         values[name] = columns.numbers(name, required=name == "contact_rate")
     for name in features:
-        values[name] = columns.numbers(name, required=False, hint=f"; {_FURTHER}")
+        numbers = columns.numbers(name, required=False, hint=f"; {_FURTHER}")
+        values[name] = without_rounding(numbers) if is_mapped else numbers
 
     if is_mapped:
         _refuse_misplaced_values(columns, features, values)

@@ -150,8 +150,9 @@ class ParameterDraws(Summary, Draws):
         for name, effect in self.places.items():
             if effect.shape[-2:] != u.shape[-2:]:
                 raise TrustboError(
-                    f"params.{name} has the grid shape {effect.shape[-2:]}, but the awareness has "
-                    f"{u.shape[-2:]}. Give the awareness of the same grid."
+                    f"the effects of places ({name}) cover a grid of {effect.shape[-2:]} cells, "
+                    f"but the awareness has {u.shape[-2:]}; fit the posterior to the workspace: "
+                    "tb.fit(missions, workspace=workspace)."
                 )
             if name == "place":  # the effect of a cell is the same for all moves that enter it
                 effect = effect[..., None, :, :]

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.arrays import read_labelled
+from trustbo.arrays import read_labelled, without_rounding
 from trustbo.data import is_line_of_sight
 from trustbo.errors import TrustboError, require_choice, require_kind
 from trustbo.team import Team
@@ -58,7 +58,7 @@ def pixel_maps(
 
     for name, parts in features.items():
         if isinstance(parts, str):
-            values = pixels[name] = values_of(parts)
+            values = pixels[name] = without_rounding(values_of(parts))
             low = np.nanmin(values, initial=0.0)
             high = np.nanmax(values, initial=1.0)
             if low < 0.0 or high > 1.0:
@@ -219,6 +219,7 @@ def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np
             "give one feature that is 0 everywhere."
         )
 
+    z = without_rounding(z)
     if (bad := (z < 0.0) | (z > 1.0)).any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         raise TrustboError(f"awareness{list(index)} = {z[index]:g} is outside [0, 1]; rescale it.")
