@@ -122,9 +122,19 @@ def test_a_policy_that_learns_by_itself_is_told_and_is_new_in_each_run(tmp_path)
     assert not case["own"]["policy"].paths
 
 
+def test_names_are_texts_whatever_they_look_like(tmp_path):
+    cases = {name: CASES["random"] for name in ("None", "01")}
+    made = run_grid(cases, {"NA": SCENES["made 0"]}, tmp_path, n_missions=1, n_jobs=1)
+    assert made["case"].tolist() == ["None", "None", "01", "01"]
+    assert set(made["scene"]) == {"NA"}
+    assert made["status"].isna().tolist() == [True, False] * 2
+
+
 def test_names_that_are_one_file_are_refused(tmp_path):
     with pytest.raises(TrustboError):
         run_grid({"a b": {}, "a-b": {}}, SCENES, tmp_path)
+    with pytest.raises(TrustboError):
+        run_grid({"a": {}, "A": {}}, SCENES, tmp_path)
 
 
 @pytest.mark.slow  # processes that import JAX

@@ -47,6 +47,18 @@ def test_numbers_of_a_run_are_those_of_its_missions():
     assert np.isnan(row["arrive later"])
 
 
+def test_runs_without_a_label_are_not_left_out():
+    table = table_by_hand()
+    table["case"] = table["case"].where(table["case"] != "bad")  # as pandas reads "None" in a file
+    table.loc[table["scene"] == "a", "kind"] = np.nan
+
+    numbers = numbers_of(table)
+    assert len(numbers) == 12
+    assert len(summary(numbers)) == 3
+    assert len(summary(numbers, by="kind")) == 2
+    assert len(differences(numbers, "ours", by=["kind"])) == 4  # two cases and two kinds
+
+
 @pytest.mark.parametrize(("regret", "until"), [([9, 9, 0], 2), ([0, 9, 0], 2), ([0, 0, 0], 0)])
 def test_a_campaign_is_near_when_it_stays_so(regret, until):
     table = table_by_hand().iloc[:3].assign(regret=regret)

@@ -15,7 +15,14 @@ from threadpoolctl import threadpool_limits
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_count, require_kind, require_list, require_whole
+from trustbo.errors import (
+    TrustboError,
+    composed,
+    require_count,
+    require_kind,
+    require_list,
+    require_whole,
+)
 from trustbo.files import FilePath, to_path, write_file
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
@@ -115,9 +122,11 @@ def run_grid(
         for seed, scene, case in runs
     }
 
-    if len(set(files.values())) < len(runs):
+    # Some file systems ignore the case of letters.
+    if len({str(file).casefold() for file in files.values()}) < len(runs):
         raise TrustboError(
-            "names of cases, and of scenes, must differ in more than punctuation; rename one."
+            "names of cases, and of scenes, must differ in more than punctuation and the case of "
+            "letters; rename one."
         )
 
     errors = Parallel(n_jobs=n_jobs)(
@@ -132,11 +141,17 @@ def run_grid(
             f"{len(failed)} of {len(runs)} runs failed; call run_grid again to repeat them. The "
             f"first errors are: {'; '.join(failed[:_N_SHOWN])}"
         )
-    return pd.concat([pd.read_csv(file) for file in files.values()], ignore_index=True)
+    return pd.concat([_read(file, *run) for run, file in files.items()], ignore_index=True)
 
 
 def _plain(name: str) -> str:
-    return re.sub(r"\W+", "-", name)
+    return re.sub(r"\W+", "-", composed(name))
+
+
+def _read(file: Path, seed: int, scene: str, case: str) -> pd.DataFrame:
+    """Read the rows of a run; names and labels are texts, even if they look like numbers or NaN."""
+    table = pd.read_csv(file, keep_default_na=False, na_values=[""])
+    return table.assign(case=case, scene=scene, seed=seed)
 
 
 def _run(

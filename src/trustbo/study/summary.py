@@ -60,8 +60,8 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
         )
 
     labels = [name for name in table.columns if name not in _JUDGED]
-    rows = [_numbers(run) for _, run in table.groupby(_RUN, sort=False)]
-    of_runs = table.groupby(_RUN, sort=False)[labels].first()
+    rows = [_numbers(run) for _, run in table.groupby(_RUN, sort=False, dropna=False)]
+    of_runs = table.groupby(_RUN, sort=False, dropna=False)[labels].first()
     return pd.concat([of_runs.reset_index(drop=True), pd.DataFrame(rows)], axis=1)
 
 
@@ -114,7 +114,7 @@ def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataF
         raise TrustboError("by must name at least one column; got none.")
 
     rows = {}
-    for key, runs in numbers.groupby(by, sort=False):
+    for key, runs in numbers.groupby(by, sort=False, dropna=False):
         label = key if len(by) > 1 else key[0]  # pyright: ignore[reportIndexIssue]
         rows[label] = bootstrap(_values(runs), runs["scene"].to_numpy())
     return _table(rows, by)
@@ -148,7 +148,7 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
 
     rows: dict[Any, dict[tuple[str, str], float]] = {}
     names = [name for name in _values(numbers) if not name.startswith("lost after")]
-    for key, runs in pairs.groupby([*by, "case 2"], sort=False):
+    for key, runs in pairs.groupby([*by, "case 2"], sort=False, dropna=False):
         less = {name: (runs[name] - runs[f"{name} 2"]).to_numpy() for name in names}
         scenes = runs["scene"].to_numpy()
 
