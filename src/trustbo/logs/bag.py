@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 
 from trustbo.data import Cell, Mission, require_unit_interval
-from trustbo.errors import TrustboError, require_pair, require_whole
+from trustbo.errors import TrustboError, one_line, require_pair, require_whole
 from trustbo.files import FilePath
 from trustbo.logs.table import read_table
 from trustbo.workspace import Workspace
@@ -84,7 +84,10 @@ def read_bag(
     missions = bounds.groupby((bounds["bound"] == 0).cumsum())
 
     if bounds.empty or (bounds["bound"] != missions.cumcount()).any():
-        raise TrustboError(f"the bounds in {_listed(paths)} must be marked 0, 1, 2, ... in order.")
+        raise TrustboError(
+            f"the bounds in {_listed(paths)} must be marked 0, 1, 2, ... in order; the markers are "
+            f"{one_line(bounds['bound'].tolist())}. Leave out markers that were recorded twice."
+        )
 
     tables = [
         _table(driven, ticks, statuses, workspace.team.names).assign(mission=mission)
