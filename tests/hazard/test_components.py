@@ -10,6 +10,7 @@ from trustbo.hazard.components import partition
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import LostMission
+from trustbo.workspace.moves import bounds_and_next
 
 
 def squares(values, ends):
@@ -62,8 +63,8 @@ def test_few_strata_have_the_chance_to_fail_that_all_draws_have(risk):
     risk, path = risk
     planner_risks = [tb.hazard.risk.Risk(risk.mean, components=risk.components(n)) for n in (1, 5)]
     product, five = (of_path.failure(path) for of_path in planner_risks)
-    rows, cols = np.array(path[1:]).T
-    drawn = 1.0 - np.prod(1.0 - risk.draw(10_000, seed=1)[:, 2, rows, cols], axis=1)
+    index = bounds_and_next(path).T
+    drawn = 1.0 - np.prod(1.0 - risk.draw(10_000, seed=1)[:, *index], axis=1)
     assert abs(five - drawn.mean()) < 0.02
     assert product > drawn.mean() + 0.04
     of_bounds = planner_risks[0].along(path).p_fail

@@ -119,6 +119,6 @@ def test_true_awareness_and_probabilities_are_read_by_name(workspace):
     )
     p = workspace.passable_bounds.astype(float)
     simulator = ModelSimulator(workspace, PARAMS, p_fail=p.isel(move=slice(None, None, -1)))
-    np.testing.assert_array_equal(simulator.p_fail, p)
+    np.testing.assert_array_equal(simulator.p_fail, np.repeat(p.values[..., None], 9, axis=-1))
     with pytest.raises(TrustboError, match="awareness"):
         ModelSimulator(workspace, PARAMS, awareness=truth.assign_coords(feature=["a", "b"]))

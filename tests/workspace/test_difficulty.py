@@ -5,6 +5,7 @@ from worlds import random_cells, terrain_of
 
 import trustbo as tb
 from trustbo.workspace.difficulty import MEASURES, difficulty_of
+from trustbo.workspace.moves import END
 
 
 def behind_a_wall(gap):
@@ -22,12 +23,13 @@ def test_difficulty_is_that_of_the_largest_tilt_and_the_least_room():
         robot = tb.Robot(max_slope=float(np.arctan(limit)))
         team = tb.Team(robots=(robot,) * 2, lead=robot)
         workspace = tb.Workspace.from_terrain(plane, (3, 3), team, sight=tb.workspace.Sight(0.0))
-        measured.append(difficulty_of(workspace).sel(move="e").values[1, 1])
+        measured.append(difficulty_of(workspace).measures.sel(move="e", next_move="e").values[1, 1])
     for (_, tilt, narrow, tight), limit in zip(measured, (1.0, 0.4), strict=True):
         # Roll along the contour; no robot's way is but straight down, with the whole as pitch.
         np.testing.assert_allclose(tilt, 0.3 / limit, rtol=1e-10)
         assert narrow == tight == 0.0  # no impassable pixel
-    wide, slim = (difficulty_of(behind_a_wall(gap)) for gap in (slice(20, 40), slice(28, 32)))
+    gaps = slice(20, 40), slice(28, 32)
+    wide, slim = (difficulty_of(behind_a_wall(gap)).measures for gap in gaps)
     assert wide["measure"].values.tolist() == list(MEASURES)
     assert np.nanmean(slim[..., 2]) > np.nanmean(wide[..., 2])
     # The wall's slope closes a pixel on either side: the way through touches these.
@@ -35,4 +37,8 @@ def test_difficulty_is_that_of_the_largest_tilt_and_the_least_room():
 
 
 def test_without_a_terrain_there_is_no_measure():
-    assert difficulty_of(random_cells()).shape == (8, 4, 4, 0)
+    difficulty = difficulty_of(random_cells())
+    assert difficulty.measures.shape == (8, 4, 4, 9, 0)
+    # All next moves of a bound are one unit, also those of the end of a path.
+    unit = difficulty.unit[difficulty.unit[..., END] >= 0]
+    assert (np.where(unit < 0, 99, unit).min(1) == unit[:, END]).all()

@@ -163,21 +163,28 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     """Make a planner that accounts for the failure probabilities of bounds.
 
     A bound that failed twice is avoided unless there is no other path, or its failure probability
-    has fallen below 0.2. Before the first failure, the user's slope limit is trusted, and failures
-    have no cost unless the user gave `failure_cost`. Under the prior alone, a cost would rule out
-    longer paths that keep contact and never fail. The cost is computed jointly over components of
+    has fallen below 0.2. If failures have a cost, it is avoided only if this applies to all of its
+    next moves, since the search weighs the others by their cost.
+
+    Before the first failure, the user's slope limit is trusted, and failures have no cost unless
+    the user gave `failure_cost`. Under the prior alone, a cost would rule out longer paths that
+    keep contact and never fail. The cost is computed jointly over components of
     the hazard posterior, since all bounds share the slope limit.
     """
     n_failures = risk.stopped + 1e-9  # expected numbers, with rounding errors
     stopped = (n_failures >= _STOPPED) & ~(risk.mean < _RECOVERED)
 
-    if stopped.any():
-        planner = planner.avoiding(stopped, risk.mean)
     if planner.problem.failure_cost is None and not risk.has_failures:
         planner = planner.with_failure_cost(0.0)
 
     problem = planner.problem
     priced = problem.objective.of_contact and problem.failure_cost != 0.0
+    avoided = stopped.any(-1)
+    if priced:
+        avoided &= (stopped | ~risk.exists).all(-1)
+    if avoided.any():
+        planner = planner.avoiding(avoided, np.nanmax(risk.mean, axis=-1, initial=0.0))
+
     components = risk.components() if priced or problem.max_failure is not None else None
     return planner.with_risk(risk.mean, risk.draw(_N_RISKS), components)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from trustbo.errors import require_share
 from trustbo.planning import InfeasibleError
-from trustbo.workspace.moves import bounds_along
+from trustbo.workspace.moves import bounds_and_next
 
 if TYPE_CHECKING:
     from trustbo.campaign.campaign import Campaign
@@ -64,7 +64,7 @@ class RegretBound:
             return None
 
         risk = campaign.risk
-        bounds = tuple(bounds_along(np.array(campaign.recommend().path)).T)
+        bounds = tuple(bounds_and_next(np.array(campaign.recommend().path)).T)
         was_completed = risk.trials[bounds] > risk.failures[bounds]
         if not was_completed.all():
             return None

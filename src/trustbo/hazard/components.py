@@ -19,7 +19,8 @@ class Components(NamedTuple):
     """Failure probabilities in each group of draws."""
 
     p_fail: np.ndarray
-    """Mean failure probability, shape (component, move, row, col); NaN where there is no bound."""
+    """Mean failure probability, shape (component, move, row, col, next_move); NaN where there is no
+    bound."""
     weights: np.ndarray
     """Fraction of the draws in each component, shape (component,); the weights sum to 1."""
 

@@ -1,8 +1,9 @@
 """Hazard model: the probability that a bound ends the mission, inferred from missions.
 
-Bound e fails with probability p_e ~ Beta(s m_e, s (1 - m_e)). The prior mean m_e depends on the
-difficulties of the bound's route and on t_e, the number of degrees by which the tilt of the route
-exceeds the slope limit:
+Bound e, together with its next move, fails with probability p_e ~ Beta(s m_e, s (1 - m_e)). Next
+moves with the same steepest route share one p_e (see `workspace.difficulty`). The prior mean m_e
+depends on the difficulties of the robots' routes and on t_e, the number of degrees by which the
+tilt of the steepest route exceeds the slope limit:
 
     1 - m_e = sigma(-logit_e) sigma(-(t_e + margin) / width),
     logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2).
@@ -29,8 +30,8 @@ from trustbo.hazard.trials import LostMission, Trials
 from trustbo.inference import importance
 from trustbo.parallel import computing
 from trustbo.workspace import Workspace
-from trustbo.workspace.difficulty import difficulty_of
-from trustbo.workspace.moves import MOVE_NAMES
+from trustbo.workspace.difficulty import Difficulty, difficulty_of
+from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES
 
 _ROUND = 1024
 """Points of importance sampling per round."""
@@ -49,7 +50,7 @@ _POSITIONS = {"strength": -1, "margin": -3}
 _MODES = {"strength": 1.5, "margin": 1.8}
 """Absolute normal scores near which the posterior may have modes: at low and high strength, and at
 a correct and a wrong limit."""
-_MAPS = "move", "row", "col"
+_MAPS = "move", "row", "col", "next_move"
 
 
 @computing()
@@ -61,7 +62,7 @@ def fit_hazard(
     lost: Sequence[LostMission] = (),
     seed: int = 0,
 ) -> xr.Dataset:
-    """Fit the failure probability of every bound by importance sampling.
+    """Fit the failure probability of every bound, with each next move, by importance sampling.
 
     Args:
         missions: Measured missions; may be empty.
@@ -75,9 +76,10 @@ def fit_hazard(
         The group `hazard` of a posterior. The posterior draws are `intercept` (draw),
         `coefficient` (draw, measure), `strength` (draw) and, with a terrain, `margin` and `width`
         (draw) of the slope limit in degrees. `place` (draw, lost) is the number, from 1, of the
-        bound at which each mission lost at an unknown place failed. `p_fail` (move, row, col) is
-        the posterior mean failure probability, and NaN where there is no bound. `trials` and
-        `failures` (move, row, col) count known outcomes. `BoundRisk` draws failure probabilities.
+        bound at which each mission lost at an unknown place failed. `p_fail` (move, row, col,
+        next_move) is the posterior mean failure probability of a bound that is followed by a next
+        move, or by the end of the path, and NaN where there is no bound. `trials` and `failures`,
+        of the same shape, count known outcomes. `BoundRisk` draws failure probabilities.
 
     Raises:
         TrustboError: If the path of a mission skips cells or leaves the grid.
@@ -92,19 +94,21 @@ def fit_hazard(
     trials = Trials.from_missions(missions, lost)
     difficulty = difficulty_of(workspace)
 
-    shape = difficulty.shape[1:3]
-    cells = trials.bounds[:, 1:]
+    measures = difficulty.measures
+    shape = measures.shape[1:3]
+    cells = trials.bounds[:, 1:3]
     outside = ((cells < 0) | (cells >= shape)).any(1)
     if outside.any():
         cell = tuple(cells[outside][0].tolist())
         raise TrustboError(f"a mission enters {cell}, outside the workspace of shape {shape}.")
 
     # A bound that was driven but does not exist on the map has the largest difficulty.
-    met = np.nan_to_num(difficulty.values[*trials.bounds.T], nan=1.0)
-    measures = difficulty["measure"].values.tolist()
-    prior = hazard.of_bounds(met, measures, workspace.team.max_slope)
+    units = trials.of_units(difficulty.unit)
+    met = np.nan_to_num(measures.values[*units.bounds.T], nan=1.0)
+    names = measures["measure"].values.tolist()
+    prior = hazard.of_bounds(met, names, workspace.team.max_slope)
     rng = np.random.default_rng(require_whole("seed", seed, 0))
-    points, places = sample(prior, trials, rng)
+    points, places = sample(prior, units, rng)
 
     group = _to_dataset(prior, trials, points, places, difficulty, seed)
     k_hat = float(np.clip(points.k_hat, -1.0, _LARGEST_KHAT))
@@ -263,7 +267,7 @@ def _to_dataset(
     trials: Trials,
     points: importance.Points,
     places: np.ndarray,
-    difficulty: xr.DataArray,
+    difficulty: Difficulty,
     seed: int,
 ) -> xr.Dataset:
     """Make the group `hazard` without `p_fail` and attributes."""
@@ -277,12 +281,13 @@ def _to_dataset(
         for name, values in zip(LIMIT_NAMES, limit.T, strict=False)  # none without a limit
     }
 
-    n, failed = np.zeros((2, *difficulty.shape[:3]))
+    n = np.zeros(difficulty.unit.shape)
+    failed = np.zeros(difficulty.unit.shape)
     n[*trials.bounds.T] = trials.n
     failed[*trials.bounds.T] = trials.failed
 
     longest = max((len(path) for path in trials.lost), default=0)
-    lost = np.full((len(trials.lost), longest, 3), -1)
+    lost = np.full((len(trials.lost), longest, len(_MAPS)), -1)
     for j, path in enumerate(trials.lost):
         lost[j, : len(path)] = trials.bounds[path]
 
@@ -299,8 +304,9 @@ def _to_dataset(
         },
         {
             "draw": np.arange(_N_DRAWS),
-            "measure": [m for m in difficulty["measure"].values.tolist() if m != TILT],
+            "measure": [m for m in difficulty.measures["measure"].values.tolist() if m != TILT],
             "axis": list(_MAPS),
             "move": list(MOVE_NAMES),
+            "next_move": list(NEXT_NAMES),
         },
     )

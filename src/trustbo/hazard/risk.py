@@ -7,7 +7,9 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
+from trustbo.arrays import read_labelled
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import OldName, Renamed, TrustboError, require_whole
@@ -15,7 +17,7 @@ from trustbo.hazard.components import Components, partition
 from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, TILT, prior_betas, steepness_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import difficulty_of
-from trustbo.workspace.moves import bounds_along
+from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES, bounds_and_next
 
 ROUNDING = 1e-12
 """Tolerance for rounding errors when the risk of a path is compared with its limit."""
@@ -30,15 +32,17 @@ _SOME = 256
 class BoundRisk(Summary):
     """Posterior of the probability that each bound of a workspace ends the mission.
 
-    Maps have shape (move, row, col), where (row, col) is the cell that a bound enters and moves are
-    ordered as in `MOVES`. Failure probabilities are NaN where there is no bound.
+    Maps have shape (move, row, col, next_move), where (row, col) is the cell that a bound enters,
+    moves are ordered as in `MOVES`, and the last next move is the end of the path. Failure
+    probabilities are NaN where there is no bound.
 
     Attributes:
-        exists: Whether each bound exists, shape (move, row, col).
-        trials: Number of trials with a known outcome, shape (move, row, col).
-        failures: Number of failures at a known bound, shape (move, row, col).
+        exists: Whether each bound exists and can be followed by the next move, shape (move, row,
+            col, next_move).
+        trials: Number of trials with a known outcome, shape (move, row, col, next_move).
+        failures: Number of failures at a known bound, shape (move, row, col, next_move).
         steepness: Degrees by which each bound exceeds the stated slope limit, shape (move, row,
-            col), or None without a limit.
+            col, next_move), or None without a limit.
 
     Example:
         >>> risk = tb.hazard.BoundRisk(tb.hazard.fit_hazard(missions, workspace), workspace)
@@ -49,20 +53,43 @@ class BoundRisk(Summary):
     strata = OldName("components")
 
     def __init__(self, hazard: xr.Dataset, workspace: Workspace) -> None:
-        """Read the group `hazard` of a posterior (see `fit_hazard`) for a workspace."""
-        self.exists = workspace.passable_bounds.values
+        """Read the group `hazard` of a posterior (see `fit_hazard`) for a workspace.
+
+        Raises:
+            TrustboError: If the group was made by version 0.4 or earlier, or is for other cells.
+        """
+        difficulty = difficulty_of(workspace)
+        shape = difficulty.unit.shape
+        if hazard["trials"].shape != shape:
+            raise TrustboError(
+                f"the hazard posterior has trials of the shape {hazard['trials'].shape}; for this "
+                f"workspace, it must be (move, row, col, next_move) = {shape}. Call fit_hazard "
+                "again with the missions; posteriors of trustbo 0.4 have no next moves."
+            )
+
+        self.exists = difficulty.unit >= 0
         self.trials = hazard["trials"].values
         self.failures = hazard["failures"].values
 
-        difficulty = difficulty_of(workspace)
-        measures = hazard["measure"].values.tolist()
+        # A unit is a bound with one or more next moves; see `workspace.difficulty`.
+        is_first = difficulty.unit == np.arange(shape[-1])
+        number = np.full(shape, -1)
+        number[is_first] = np.arange(is_first.sum())
+        first = np.maximum(difficulty.unit, 0)
+        self._unit = np.where(self.exists, np.take_along_axis(number, first, -1), -1)
+        self._trials = self._of_units(self.trials)
+        self._failures = self._of_units(self.failures)
+
+        names = hazard["measure"].values.tolist()
         limit = [n for n in LIMIT_NAMES if n in hazard]
-        self._difficulty = difficulty.sel(measure=measures).values - REFERENCE
+        self._difficulty = difficulty.measures.sel(measure=names).values[is_first] - REFERENCE
         self.steepness = None
+        self._steepness = None
 
         if limit:
-            tilt = difficulty.sel(measure=TILT).values
+            tilt = difficulty.measures.sel(measure=TILT).values
             self.steepness = steepness_of(tilt, workspace.team.max_slope)
+            self._steepness = self.steepness[is_first]
 
         self._strength = hazard["strength"].values  # (draw,)
         intercept = hazard["intercept"].values[:, None]
@@ -76,26 +103,43 @@ class BoundRisk(Summary):
         self._place = hazard["place"].values  # (draw, lost), from 1
 
     def _rows(self) -> Rows:
-        n_driven = int((self.trials[self.exists] > 0).sum())
+        is_bound = self.exists.any(-1)
+        n_driven = int((self.trials.sum(-1)[is_bound] > 0).sum())
         n_unknown = len(self._lost)
         failures = f"{int(self.failures.sum())} at a known bound"
         if n_unknown:
             failures += f", {n_unknown} in an unknown bound of a path"
 
         return [
-            ("bounds", f"{int(self.exists.sum())}, of which {n_driven} were driven"),
+            ("bounds", f"{int(is_bound.sum())}, of which {n_driven} were driven"),
             ("trials", f"{int(self.trials.sum())}"),
             ("failures", failures),
             *_rows_of_failures(self.mean),
         ]
 
+    def _of_units(self, counts: np.ndarray) -> np.ndarray:
+        """Add up counts (move, row, col, next_move) over the next moves of each unit, (unit,)."""
+        n_units = int(self._unit.max(initial=-1)) + 1
+        return np.bincount(self._unit[self.exists], counts[self.exists], n_units)
+
+    def _maps(self, values: np.ndarray) -> np.ndarray:
+        """Return values (..., unit) as maps (..., move, row, col, next_move)."""
+        nowhere = np.full((*values.shape[:-1], 1), np.nan)
+        values = np.concatenate([values, nowhere], axis=-1)
+
+        of_bounds = self._unit.max(-1)
+        if ((self._unit == of_bounds[..., None]) | ~self.exists).all():  # as without a terrain
+            maps = values[..., of_bounds]
+            return np.broadcast_to(maps[..., None], (*maps.shape, self._unit.shape[-1]))
+        return values[..., self._unit]
+
     @cached_property
     def mean(self) -> np.ndarray:
-        """Posterior mean of the failure probability, shape (move, row, col)."""
-        mean = np.full(self.exists.shape, np.nan)
-        for bounds, a, b in self._betas():
-            mean.flat[bounds] = (a / (a + b)).mean(0)
-        return mean
+        """Posterior mean of the failure probability, shape (move, row, col, next_move)."""
+        mean = np.empty(len(self._trials))
+        for units, a, b in self._betas():
+            mean[units] = (a / (a + b)).mean(0)
+        return self._maps(mean)
 
     @property
     def has_failures(self) -> bool:
@@ -104,15 +148,20 @@ class BoundRisk(Summary):
 
     @cached_property
     def stopped(self) -> np.ndarray:
-        """Posterior mean of the number of past failures on each bound, shape (move, row, col)."""
-        counts = self.failures.copy()
+        """Posterior mean of the number of past failures, shape (move, row, col, next_move).
+
+        Next moves with the same steepest route share their failures.
+        """
+        counts = self._failures.copy()
         for j, path in enumerate(self._lost):
             for k, bound in enumerate(path, start=1):
-                counts[*bound] += (self._place[:, j] == k).mean()
-        return counts
+                unit = self._unit[*bound]
+                if unit >= 0:
+                    counts[unit] += (self._place[:, j] == k).mean()
+        return np.nan_to_num(self._maps(counts))
 
     def draw(self, n: int, seed: int = 0) -> np.ndarray:
-        """Draw the failure probabilities, shape (draw, move, row, col).
+        """Draw the failure probabilities, shape (draw, move, row, col, next_move).
 
         Args:
             n: Number of draws. The hyperparameter draws are evenly spaced in order of severity, so
@@ -124,10 +173,10 @@ class BoundRisk(Summary):
         steps = (np.arange(require_whole("n", n, 1)) + 0.5) / n
         chosen = rng.permutation(order[(steps * len(order)).astype(int)])
 
-        out = np.full((n, *self.exists.shape), np.nan)
-        for bounds, a, b in self._betas(chosen):
-            out.reshape(n, -1)[:, bounds] = rng.beta(a, b)
-        return out
+        out = np.empty((n, len(self._trials)))
+        for units, a, b in self._betas(chosen):
+            out[:, units] = rng.beta(a, b)
+        return self._maps(out)
 
     def components(self, n: int = 5) -> Components:
         """Average the failure probabilities within at most `n` groups of draws (see `Components`).
@@ -143,54 +192,51 @@ class BoundRisk(Summary):
         # One product averages over the members of each group.
         weights = (member == np.arange(len(ends))[:, None]) / sizes[:, None]
 
-        p_fail = np.full((len(ends), *self.exists.shape), np.nan)
-        for bounds, a, b in self._betas():
-            p_fail.reshape(len(ends), -1)[:, bounds] = weights @ (a / (a + b))
-        return Components(p_fail, sizes / sizes.sum())
+        p_fail = np.empty((len(ends), len(self._trials)))
+        for units, a, b in self._betas():
+            p_fail[:, units] = weights @ (a / (a + b))
+        return Components(self._maps(p_fail), sizes / sizes.sum())
 
     @cached_property
     def _severity(self) -> np.ndarray:
-        """Mean failure probability (draw,) over a subset of bounds for each hyperparameter draw."""
-        every = np.flatnonzero(self.exists)
-        step = 1 + len(every) // _SOME
-        a, b = self._betas_of(every[::step])
+        """Mean failure probability (draw,) over a subset of units for each hyperparameter draw."""
+        n_units = len(self._trials)
+        step = 1 + n_units // _SOME
+        a, b = self._betas_of(slice(0, n_units, step))
         return (a / (a + b)).mean(1)
 
-    def _betas(self, draws: Any = slice(None)) -> Iterator[tuple[np.ndarray, ...]]:
-        """Yield chunks of existing bounds: flat indices, and alpha and beta (draw, bound)."""
-        every = np.flatnonzero(self.exists)
+    def _betas(self, draws: Any = slice(None)) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+        """Yield chunks of units: their slice, and alpha and beta (draw, unit)."""
         n_draws = len(self._strength[draws])
         step = max(1, _ENTRIES // n_draws)
-        for start in range(0, len(every), step):
-            bounds = every[start : start + step]
-            yield bounds, *self._betas_of(bounds, draws)
+        for start in range(0, len(self._trials), step):
+            units = slice(start, start + step)
+            yield units, *self._betas_of(units, draws)
 
-    def _betas_of(self, bounds: np.ndarray, draws: Any = slice(None)) -> tuple[np.ndarray, ...]:
-        """Return alpha and beta (draw, bound) of the posterior Beta distributions of bounds."""
-        where = np.unravel_index(bounds, self.exists.shape)
-        steepness = None if self.steepness is None else self.steepness[where]
+    def _betas_of(self, units: slice, draws: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """Return alpha and beta (draw, unit) of the posterior Beta distributions of units."""
         a, b = prior_betas(
             self._weights[draws],
             self._limit[draws],
             self._strength[draws],
-            self._difficulty[where],
-            steepness,
+            self._difficulty[units],
+            None if self._steepness is None else self._steepness[units],
         )
 
-        n = self.trials.ravel()[bounds]
-        failed = self.failures.ravel()[bounds]
+        failed = self._failures[units]
         a = a + failed
-        b = b + n - failed
+        b = b + self._trials[units] - failed
 
-        position = np.full(self.exists.shape, -1)
-        position[where] = np.arange(len(bounds))
+        n_units = len(self._trials)
+        position = np.full(n_units + 1, -1)  # the last stands for bounds that do not exist
+        position[:n_units][units] = np.arange(len(failed))
         for j, path in enumerate(self._lost):
-            add_lost(position[*path.T], self._place[draws, j] - 1, a, b)
+            add_lost(position[self._unit[*path.T]], self._place[draws, j] - 1, a, b)
         return a, b
 
 
 def _rows_of_failures(p_fail: np.ndarray) -> Rows:
-    """Summarise failure probabilities (move, row, col)."""
+    """Summarise failure probabilities (move, row, col, next_move)."""
     p = p_fail[np.isfinite(p_fail)]
     if not p.size:
         return [("failure probability", "no bound can be driven")]
@@ -215,9 +261,9 @@ class Risk(Summary):
     """Probability that each bound of a workspace ends the mission.
 
     Attributes:
-        p_fail: Posterior mean, shape (move, row, col), with moves as in `MOVES`; NaN where there
-            is no bound.
-        draws: Posterior draws, shape (draw, move, row, col), or None.
+        p_fail: Posterior mean, shape (move, row, col, next_move), with moves as in `MOVES`; the
+            last next move is the end of the path. It is NaN where there is no bound.
+        draws: Posterior draws, shape (draw, move, row, col, next_move), or None.
         components: Mean failure probabilities of groups of draws, used for the failure probability
             of a path. If None, bounds are assumed to fail independently with probability `p_fail`.
 
@@ -235,8 +281,10 @@ class Risk(Summary):
         for name, p in {"p_fail": self.p_fail[None], **more}.items():
             if p is None:
                 continue
-            if p.ndim != 4 or not len(p) or p.shape[1:] != self.p_fail.shape:
-                raise TrustboError(f"{name} must have shape (..., move, row, col); got {p.shape}.")
+            if p.ndim != 5 or not len(p) or p.shape[1:] != self.p_fail.shape:
+                raise TrustboError(
+                    f"{name} must have shape (..., move, row, col, next_move); got {p.shape}."
+                )
             bad = (p < 0.0) | (p > 1.0)
             if bad.any():
                 raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")
@@ -250,12 +298,19 @@ class Risk(Summary):
             ("failures of bounds", together),
         ]
 
+    @property
+    def of_bounds(self) -> np.ndarray:
+        """Failure probability of each bound, shape (move, row, col), averaged over next moves."""
+        known = np.isfinite(self.p_fail)
+        total = np.where(known, self.p_fail, 0.0).sum(-1)
+        return np.where(known.any(-1), total / np.maximum(known.sum(-1), 1), np.nan)
+
     def failure(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Compute the failure probability of a path, for `failure_cost` and `max_failure`.
 
         It is averaged over the components, since failures of bounds are correlated.
         """
-        index = tuple(bounds_along(path).T)
+        index = tuple(bounds_and_next(path).T)
         if self.components is None:
             return float(1.0 - np.prod(1.0 - self.p_fail[index]))
 
@@ -264,7 +319,7 @@ class Risk(Summary):
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
         """Compute the risk along a path."""
-        index = tuple(bounds_along(path).T)
+        index = tuple(bounds_and_next(path).T)
         p = self.p_fail[index]
         reach = np.cumprod(1.0 - p)
         if self.draws is None:
@@ -281,6 +336,28 @@ class Risk(Summary):
 
         reach = np.minimum.accumulate(np.minimum(reach * ratio, 1.0 - p))
         return PathRisk(p, float(reach[-1]), (low, high))
+
+
+def read_risk(what: str, values: ArrayLike, leading: Sequence[str] = ()) -> np.ndarray:
+    """Read probabilities of bounds with their next moves, (..., move, row, col, next_move).
+
+    Args:
+        what: Name of the argument in messages.
+        values: Array of that shape, or without the axis of the next moves, which then do not
+            matter. A DataArray is read by its dims and labels.
+        leading: Names of the leading axes.
+
+    Raises:
+        TrustboError: If the dims or labels are wrong.
+    """
+    dims = *leading, "move", "row", "col"
+    labels = {"move": MOVE_NAMES, "next_move": NEXT_NAMES}
+    n_dims = len(values.dims) if isinstance(values, xr.DataArray) else np.ndim(values)
+    if n_dims > len(dims):
+        return read_labelled(what, values, (*dims, "next_move"), labels).values
+
+    maps = read_labelled(what, values, dims, labels).values
+    return np.broadcast_to(maps[..., None], (*maps.shape, len(NEXT_NAMES)))
 
 
 class PathRisk(NamedTuple):

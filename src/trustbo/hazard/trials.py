@@ -1,4 +1,8 @@
-"""Trials of bounds: how often each bound was begun and how often it ended a mission."""
+"""Trials of bounds: how often each bound was begun and how often it ended a mission.
+
+Whether a bound is completed depends on the next move (see `workspace.difficulty`), so bounds are
+counted with their next moves.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple, Self
@@ -7,7 +11,7 @@ import numpy as np
 
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError
-from trustbo.workspace.moves import bounds_along
+from trustbo.workspace.moves import bounds_and_next
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
 """Statuses of bounds that failed; aborted bounds and missions do not count as failed."""
@@ -30,8 +34,9 @@ class Trials(NamedTuple):
     """Trials of attempted bounds, which are sufficient statistics of the hazard model.
 
     Attributes:
-        bounds: Distinct bounds in lexicographic order, shape (bound, 3). The columns are the index
-            of the move in `MOVES` and the row and column of the cell entered.
+        bounds: Distinct bounds in lexicographic order, shape (bound, 4). The columns are the index
+            of the move in `MOVES`, the row and column of the cell entered, and the index of the
+            next move, which is `END` at the end of a path.
         n: Number of trials with a known outcome, shape (bound,).
         failed: Number of failures among the trials in `n`, shape (bound,).
         lost: Planned bounds of each mission lost at an unknown place, as indices into `bounds`.
@@ -55,10 +60,10 @@ class Trials(NamedTuple):
         """
         known = [_reported(mission) for mission in missions]
         known += [_located(mission) for mission in lost if mission.where is not None]
-        unknown = [bounds_along(mission.path) for mission in lost if mission.where is None]
+        unknown = [bounds_and_next(mission.path) for mission in lost if mission.where is None]
 
         met = [tried for tried, _ in known] + unknown
-        rows = np.concatenate([np.empty((0, 3), int), *met])
+        rows = np.concatenate([np.empty((0, 4), int), *met])
         bounds, index = np.unique(rows, axis=0, return_inverse=True)
         paths = np.split(index, np.cumsum([len(part) for part in met])[:-1]) if met else []
 
@@ -68,9 +73,26 @@ class Trials(NamedTuple):
             np.add.at(failed, path, fails)
         return cls(bounds, n, failed, tuple(paths[len(known) :]))
 
+    def of_units(self, unit: np.ndarray) -> Self:
+        """Add up the trials of each unit, whose next moves pass or fail together.
+
+        Args:
+            unit: Next move that stands for the unit of each bound, (move, row, col, next_move); see
+                `workspace.difficulty.Difficulty`. It is negative for a bound that is not on the
+                map, which is a unit of its own.
+        """
+        rows = self.bounds.copy()
+        of_rows = unit[*rows.T]
+        rows[:, 3] = np.where(of_rows >= 0, of_rows, rows[:, 3])
+
+        bounds, index = np.unique(rows, axis=0, return_inverse=True)
+        n = np.bincount(index, self.n, len(bounds))
+        failed = np.bincount(index, self.failed, len(bounds))
+        return type(self)(bounds, n, failed, tuple(index[path] for path in self.lost))
+
 
 def _reported(mission: Mission) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounds with a known outcome, (bound, 3), and whether each one failed."""
+    """Return the bounds with a known outcome, (bound, 4), and whether each one failed."""
     path = mission.path
     statuses = [*(bound.status for bound in mission.bounds[:-1]), mission.status]
 
@@ -81,7 +103,9 @@ def _reported(mission: Mission) -> tuple[np.ndarray, np.ndarray]:
         if status == "ok" and not goes_back:
             is_known[k] = True
 
-    return bounds_along(path[: len(statuses) + 1])[is_known], fails[is_known]
+    # The path is the planned one, so that the next move is known also for the last bound.
+    tried = bounds_and_next(path[: len(statuses) + 2])[: len(statuses)]
+    return tried[is_known], fails[is_known]
 
 
 def _located(mission: LostMission) -> tuple[np.ndarray, np.ndarray]:
@@ -90,4 +114,4 @@ def _located(mission: LostMission) -> tuple[np.ndarray, np.ndarray]:
         raise TrustboError(f"where must be a cell that the path enters; got {mission}.")
 
     n = mission.path.index(mission.where, 1)
-    return bounds_along(mission.path[: n + 1]), np.arange(1, n + 1) == n
+    return bounds_and_next(mission.path[: n + 2])[:n], np.arange(1, n + 1) == n

@@ -55,8 +55,9 @@ class Costs(NamedTuple):
     (n_bounds_left, robot) times `drift` (robot, bound). `start` (n_bounds_left,) is the constant
     cost of paths with a given number of bounds. `transition` (robot, robot) and `x0` (robot,)
     define the recursion for trust, or are empty if there is no loss. `sd` is the sd of a rate.
-    `risk` has the shape (bound, sum), `failure` (sum,) contains F_m, `share` (sum,) contains w_m,
-    and `limit` is the largest failure probability allowed.
+    `risk` has the shape (edge, sum), because a risk depends on the bound before an edge, `failure`
+    (sum,) contains F_m, `share` (sum,) contains w_m, and `limit` is the largest failure probability
+    allowed.
     """
 
     loss: int
@@ -232,7 +233,7 @@ def _try_paths(graph, costs, edge_cost, to_go, known):
         for e in known.trial[:n]:
             cost += edge_cost[e] + _lost_on(graph, costs, e, x, after)
             x[:] = after
-            sums += costs.risk[graph.bound[e]]
+            sums += costs.risk[e]
         cost += _failing(costs.failure, sums)
 
         if cost < known.cost[0] and not _is_beyond(costs, sums):
@@ -252,7 +253,7 @@ def _fill_priced(graph, costs, least_cost, price, to_go):
     cost = least_cost.copy()
     for e in range(len(cost)):
         for m in range(len(price)):
-            cost[e] += price[m] * costs.risk[graph.bound[e], m]
+            cost[e] += price[m] * costs.risk[e, m]
 
     fill_to_go(graph, cost, to_go)
 
@@ -510,7 +511,7 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
 
         lost = _lost_on(graph, costs, e, number[1 + n_sums :], after)
         cost = number[0] + (edge_cost[e] + lost)
-        sums[:] = number[1 : 1 + n_sums] + costs.risk[graph.bound[e]]
+        sums[:] = number[1 : 1 + n_sums] + costs.risk[e]
         if _is_hopeless(costs, limits, h, cost, sums, known.cost[0]):
             continue
 

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, one_line, require_kind, require_whole
-from trustbo.planning.unrolled import Unrolled
+from trustbo.planning.unrolled import Paired, Unrolled, paired
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVES, moves_along, require_on_grid
@@ -191,6 +191,11 @@ class AdmissiblePaths:
         start = np.flatnonzero(near == 0)[0]
         starts = rank[base[start] : base[start + 1]]
         return Unrolled(cell, n_bounds_left, first, head, bound, starts, self.turns)
+
+    @cached_property
+    def paired(self) -> Paired:
+        """Unrolled graph whose edges know the bound before them, for risks; see `graph`."""
+        return paired(self.graph, self.bounds[0].size)
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
         """Return the paths that avoid the given bounds.

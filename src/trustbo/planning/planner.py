@@ -22,7 +22,7 @@ from trustbo.errors import (
     require_positive,
 )
 from trustbo.hazard.components import Components
-from trustbo.hazard.risk import Risk
+from trustbo.hazard.risk import Risk, read_risk
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
 from trustbo.models.params import ParameterDraws
@@ -218,25 +218,28 @@ class Planner(Summary):
         draws: ArrayLike | None = None,
         components: Components | None = None,
     ) -> Self:
-        """Return a planner with the given failure probability of each bound.
+        """Return a planner with the given failure probability of each bound, with each next move.
 
         With a risk, plans respect `max_failure` and have an arrival probability `p_arrive`. For
         lost_contact, the value of a plan includes the expected cost of failure.
 
         Args:
-            p_fail: Posterior mean, shape (move, row, col); NaN where there is no bound.
-            draws: Posterior draws, shape (draw, move, row, col), for `p_arrive` and its 90 % band.
+            p_fail: Posterior mean, shape (move, row, col, next_move), with the end of the path as
+                the last next move, such as `BoundRisk.mean`; or shape (move, row, col), if the
+                next move does not matter. NaN where there is no bound.
+            draws: Posterior draws, with a leading axis (draw,), for `p_arrive` and its 90 % band.
             components: Mean failure probabilities of groups of draws, such as
-                `BoundRisk.components()`, for the expected cost of failure. By default, bounds fail
-                independently with `p_fail`.
+                `BoundRisk.components()`, for the expected cost of failure, with a leading axis
+                (component,). By default, bounds fail independently with `p_fail`.
 
         Raises:
             TrustboError: If the shapes do not match, or a probability is outside [0, 1].
         """
-        mean = read_labelled("p_fail", p_fail, _DIMS, _MOVE_LABELS).values
-        drawn = None
-        if draws is not None:
-            drawn = read_labelled("draws", draws, ("draw", *_DIMS), _MOVE_LABELS).values
+        mean = read_risk("p_fail", p_fail)
+        drawn = None if draws is None else read_risk("draws", draws, ("draw",))
+        if components is not None:
+            groups = read_risk("components", components.p_fail, ("component",))
+            components = components._replace(p_fail=groups)
         return self._with(risk=Risk(mean, drawn, components))
 
     def with_failure_cost(self, failure_cost: float) -> Self:
@@ -391,7 +394,8 @@ class Planner(Summary):
         - `trust`: the team's stationary trust, the limit of trust if the bound is repeated.
         - `lost`: contact lost at this trust, in bounds, plus the bound cost.
         - `cost`: what the bound takes from the objective at this trust; see below.
-        - `risk`: -log(1 - p_fail), if the planner has a risk.
+        - `risk`: -log(1 - p), if the planner has a risk, where p is the failure probability of the
+          bound, averaged over the next moves.
 
         The algorithms of networkx minimise a sum over edges. If beta0 is 0, trust is not carried
         over, and the sum of `cost` along a path to the goal gives its value:
@@ -447,7 +451,7 @@ class Planner(Summary):
             "cost": cost,
         }
         if problem.risk is not None:
-            values["risk"] = of_bounds(risk_of(problem.risk.p_fail))
+            values["risk"] = of_bounds(risk_of(problem.risk.of_bounds))
 
         graph = nx.DiGraph(constant=constant)
         for row, col in np.argwhere(self.workspace.passable.values).tolist():

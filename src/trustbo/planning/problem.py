@@ -24,7 +24,7 @@ from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.recursion import Recursion, trust_recursion
 from trustbo.planning.sums import best_sums
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVE_NAMES, bounds_along
+from trustbo.workspace.moves import END, MOVE_NAMES, NEXT_NAMES, bounds_along, possible_next
 
 EXACT = 1e-12
 """Tolerance: a path is optimal if its score is within this distance of the upper limit."""
@@ -93,7 +93,7 @@ class Problem:
                     f"{self.objective.name!r} does not measure contact; use max_failure instead."
                 )
 
-        shape = self.paths.bounds.shape
+        shape = (*self.paths.bounds.shape, END + 1)
         if self.risk is not None and self.risk.p_fail.shape != shape:
             raise TrustboError(f"p_fail must have the shape {shape}; got {self.risk.p_fail.shape}.")
 
@@ -148,7 +148,7 @@ class Problem:
         if self.objective.of_contact:
             if self.risk is None:
                 return lost, 0.0
-            return lost + self.price * np.nan_to_num(self.risk.p_fail[bounds]), 0.0
+            return lost + self.price * np.nan_to_num(self.risk.of_bounds[bounds]), 0.0
 
         bound_cost = self.bound_cost[bounds]
         credit = self.objective.credit(np.arange(self.paths.longest + 1))
@@ -207,16 +207,18 @@ class Problem:
             return None
 
         p_fail, weights = self._components
-        missing = np.isnan(p_fail).any(0) & self.paths.bounds
+        missing = np.isnan(p_fail).any(0) & possible_next(self.paths.bounds)
         if missing.any():
-            move, row, col = np.argwhere(missing)[0].tolist()
+            move, row, col, after = np.argwhere(missing)[0].tolist()
             raise TrustboError(
                 f"p_fail is NaN for the bound that enters {(row, col)} by the move "
-                f"{MOVE_NAMES[move]!r}; give a probability for every possible bound."
+                f"{MOVE_NAMES[move]!r}, followed by {NEXT_NAMES[after]!r}; give a probability for "
+                "every possible bound."
             )
 
         limit = np.inf if self.max_failure is None else self.max_failure + ROUNDING
-        return Risks(risks_by_bound(p_fail), self.price, weights, limit)
+        risks = self.paths.paired.of_edges(risks_by_bound(p_fail))
+        return Risks(risks, self.price, weights, limit)
 
     @property
     def _components(self) -> Components:
@@ -239,7 +241,7 @@ class Problem:
         self._require_valid(recursion, history)
         recursion = capped(self.objective, self.likelihood, recursion).flat()
 
-        graph = self.paths.graph
+        graph = self.paths.graph if self.risks is None else self.paths.paired.graph
         n_draws, n_states = recursion.start.shape
         drift = recursion.drift.reshape(n_draws, n_states, -1)
         bound_cost = self.bound_cost.ravel()
@@ -257,7 +259,7 @@ class Problem:
             loss = LOSSES[self.likelihood.expected_rate]
             weights = Weights(0.0 * weights.per_bound, 0.0 * weights.constant, weights.scale)
 
-        risks = self.risks or Risks(np.zeros((len(bound_cost), 1)), 0.0, np.zeros(1), np.inf)
+        risks = self.risks or Risks(np.zeros((len(graph.head), 1)), 0.0, np.zeros(1), np.inf)
         costs = Costs(
             loss=loss,
             drift=drift,
@@ -267,7 +269,7 @@ class Problem:
             x0=recursion.start[:, :n_trust].copy(),
             sd=np.maximum(recursion.noise_sd, TINY_SD),
             bound_cost=bound_cost,
-            risk=risks.of_bounds,
+            risk=risks.of_edges,
             failure=risks.price * risks.weights,
             share=risks.weights,
             limit=risks.limit,
@@ -283,10 +285,11 @@ class Problem:
         Returns:
             The path, and its failure probability, which accounts for the components of the risk.
         """
-        graph = self.paths.graph
+        paired = self.paths.paired
+        graph = paired.graph
         p_fail, weights = self._components
-        of_bounds = risks_by_bound(p_fail)
-        n_bounds, n = len(of_bounds), graph.longest + 1
+        n_bounds = self.bound_cost.size
+        n = graph.longest + 1
 
         # No bound costs anything, and a failure costs 1.
         costs = Costs(
@@ -298,7 +301,7 @@ class Problem:
             x0=np.zeros((1, 0)),
             sd=np.ones(1),
             bound_cost=np.zeros(n_bounds),
-            risk=of_bounds,
+            risk=paired.of_edges(risks_by_bound(p_fail)),
             failure=weights,
             share=weights,
             limit=np.inf,
@@ -340,13 +343,14 @@ class Problem:
 class Risks(NamedTuple):
     """Risks -log(1 - p_fail) of the bounds, which the search sums along a path.
 
-    `of_bounds` (bound, component) has one column per component of the risk. A path whose risks add
+    `of_edges` (edge, component) contains the risks of the bounds that each edge of `paths.paired`
+    completes, with one column per component of the risk. A path whose risks add
     up to r_m in column m fails with the probability sum_m w_m (1 - exp(-r_m)), where `weights`
     (component,) contains the w_m. This probability must not exceed `limit`, and a failure costs
     `price`.
     """
 
-    of_bounds: np.ndarray
+    of_edges: np.ndarray
     price: float
     weights: np.ndarray
     limit: float
@@ -359,7 +363,11 @@ def risk_of(p_fail: np.ndarray) -> np.ndarray:
 
 
 def risks_by_bound(p_fail: np.ndarray) -> np.ndarray:
-    """Compute the risks (bound, component) of failure probabilities (component, move, row, col)."""
+    """Compute risks (bound, component); a bound is a flat index into (move, row, col, next_move).
+
+    Args:
+        p_fail: Failure probabilities, shape (component, move, row, col, next_move).
+    """
     return np.ascontiguousarray(risk_of(p_fail).reshape(len(p_fail), -1).T)
 
 

@@ -13,6 +13,7 @@ import networkx as nx
 import numpy as np
 
 from trustbo import kernels
+from trustbo.workspace.moves import END
 
 kernel = kernels.kernel()
 """Numba decorator of the kernels of the search."""
@@ -76,6 +77,86 @@ class Unrolled(NamedTuple):
                     nodes.append(onward)
 
         return graph
+
+
+class Paired(NamedTuple):
+    """Unrolled graph for costs that depend on a bound and on the next move.
+
+    A state of `graph` is a state of the plain graph together with the bound that led there, so that
+    each edge knows the bound before it. U-turns are excluded by leaving out their edges.
+
+    Attributes:
+        graph: Unrolled graph; its attribute `turns` is True, as no search has to exclude U-turns.
+        completed: Flat index into (move, row, col, next_move) of the bound before each edge, with
+            the move of the edge as the next move, shape (edge,); -1 if the edge leaves the start.
+        last: The same index of the edge's own bound if it enters the goal, shape (edge,), else -1.
+    """
+
+    graph: Unrolled
+    completed: np.ndarray
+    last: np.ndarray
+
+    def of_edges(self, values: np.ndarray) -> np.ndarray:
+        """Add up values of bounds with their next moves over the bounds that each edge completes.
+
+        Args:
+            values: Values (bound, ...), where the index of a bound is a flat index into (move, row,
+                col, next_move).
+
+        Returns:
+            Sums (edge, ...). The sum along a path contains each bound of the path once.
+        """
+        nothing = np.zeros((1, *values.shape[1:]))
+        padded = np.concatenate([values, nothing])  # the index -1
+        return padded[self.completed] + padded[self.last]
+
+
+def paired(graph: Unrolled, n_cells: int) -> Paired:
+    """Add the bound that led to each state to the states of a graph.
+
+    Args:
+        graph: Plain graph.
+        n_cells: Number of cells of the grid.
+    """
+    n_moves = END
+    move = graph.bound // n_cells  # of each edge
+
+    # A state has the key `number of the plain state` x 9 + `move that led there`, where 8 stands
+    # for the start, so that the order of the states is kept. All ways to enter the goal are one.
+    width = n_moves + 1
+    onward = np.where(graph.head > 0, graph.head.astype(np.int64) * width + move, 0)
+    begun = graph.starts.astype(np.int64) * width + n_moves
+    keys = np.unique(np.concatenate([[0], begun, onward]))
+    plain_state, came_by = np.divmod(keys, width)
+
+    # Repeat the edges of each plain state for each move that led there.
+    n_edges = np.diff(graph.first)[plain_state]
+    tail = np.repeat(np.arange(len(keys)), n_edges)
+    before = np.cumsum(n_edges) - n_edges
+    edge = np.arange(len(tail)) - before[tail] + graph.first[plain_state[tail]]
+    if not graph.turns:
+        is_kept = move[edge] != n_moves - 1 - came_by[tail]  # the reverse of move m is move 7 - m
+        tail, edge = tail[is_kept], edge[is_kept]
+
+    first = np.searchsorted(tail, np.arange(len(keys) + 1))
+    head = np.searchsorted(keys, onward[edge]).astype(np.int32)
+
+    left = graph.cell[plain_state[tail]]  # the cell in which the bound before the edge ended
+    by = came_by[tail]
+    completed = np.where(by < n_moves, (by * n_cells + left) * width + move[edge], -1)
+    bound = graph.bound[edge]
+    last = np.where(head == 0, bound.astype(np.int64) * width + END, -1)
+
+    whole = Unrolled(
+        cell=graph.cell[plain_state],
+        n_bounds_left=graph.n_bounds_left[plain_state],
+        first=first,
+        head=head,
+        bound=bound,
+        starts=np.searchsorted(keys, begun).astype(graph.starts.dtype),
+        turns=True,
+    )
+    return Paired(whole, completed, last)
 
 
 class ToGo(NamedTuple):

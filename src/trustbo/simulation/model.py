@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
+from trustbo.hazard.risk import read_risk
 from trustbo.models import PooledTrust
 from trustbo.models.draws import Draws
 from trustbo.models.model import TrustModel
@@ -15,7 +16,7 @@ from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.statespace import kalman
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVE_NAMES, along, bounds_along, moves_along
+from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES, along, bounds_along, bounds_and_next
 
 _STREAM = 0x6D697373  # makes the random numbers differ from others with the same seed
 
@@ -52,8 +53,9 @@ class ModelSimulator(DescribedSimulator):
             awareness: True awareness, shape (robot, move, row, col, feature), which missions
                 measure along their paths; by default the workspace's awareness.
             n_ticks: Number of ticks of each bound, for the beta-binomial family only.
-            p_fail: Probability that a bound fails, shape (move, row, col), such as a draw of
-                `hazard.risk.BoundRisk`. Failed bounds are "stuck". By default, no bound fails.
+            p_fail: Probability that a bound fails, shape (move, row, col, next_move), such as a
+                draw of `hazard.BoundRisk`, or shape (move, row, col). Failed bounds are "stuck". By
+                default, no bound fails.
 
         Raises:
             TrustboError: The robots or features of the parameters or awareness do not match the
@@ -135,7 +137,7 @@ class ModelSimulator(DescribedSimulator):
         if self.p_fail is None:
             return n, "ok"
         rng = stream(seed, "failures")
-        p = self.p_fail[moves_along(cells), *np.array(cells)[1:].T]
+        p = self.p_fail[*bounds_and_next(cells).T]
         failed = np.flatnonzero(rng.random(n) < p)
         return (int(failed[0]) + 1, "stuck") if len(failed) else (n, "ok")
 
@@ -147,10 +149,13 @@ def _labels_of(workspace: Workspace) -> tuple[tuple[str, ...], dict[str, tuple[s
 
 
 def _require_probabilities(p_fail: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Check failure probabilities (move, row, col), and return them as an array."""
-    p = read_labelled("p_fail", p_fail, ("move", "row", "col"), {"move": MOVE_NAMES}).values
-    if p.shape != shape:
-        raise TrustboError(f"p_fail must have the shape (move, row, col) = {shape}; got {p.shape}.")
+    """Check failure probabilities, and return them as (move, row, col, next_move)."""
+    p = read_risk("p_fail", p_fail)
+    if p.shape[:3] != shape or p.shape[3:] != (len(NEXT_NAMES),):
+        raise TrustboError(
+            f"p_fail must have the shape (move, row, col) = {shape}, or that with a last axis "
+            f"next_move of length {len(NEXT_NAMES)}; got {np.shape(p_fail)}."
+        )
     bad = (p < 0.0) | (p > 1.0)
     if bad.any():
         raise TrustboError(f"p_fail must be in [0, 1]; got {p[bad][0]:g}.")

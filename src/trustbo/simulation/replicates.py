@@ -10,10 +10,8 @@ from trustbo.data import Cell
 from trustbo.parallel import in_order
 from trustbo.simulation.kinematic import KinematicSimulator, State
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVE_NAMES, MOVES
+from trustbo.workspace.moves import END, MOVE_NAMES, MOVES, NEXT_NAMES, possible_next
 
-END = len(MOVES)
-"""Index used instead of the next move for a bound that enters the goal."""
 _DIMS = ("move", "row", "col", "next_move")
 
 
@@ -35,19 +33,19 @@ type Outcomes = Iterator[tuple[Edge, list[tuple[float, str]]]]
 
 def table_of(contact: np.ndarray, passed: np.ndarray) -> xr.Dataset:
     """Make a dataset like `Truth.bounds` from arrays (move, row, col, next_move)."""
-    names = {"move": list(MOVE_NAMES), "next_move": [*MOVE_NAMES, "end"]}
+    names = {"move": list(MOVE_NAMES), "next_move": list(NEXT_NAMES)}
     return xr.Dataset({"contact": (_DIMS, contact), "passed": (_DIMS, passed)}, names)
 
 
 def edges_of(workspace: Workspace) -> list[Edge]:
     """List the bounds of a workspace for which all robots have routes."""
     exists = workspace.passable_bounds.values
-    around = np.pad(exists, ((0, 0), (1, 1), (1, 1)))
+    follows = possible_next(exists)
     edges = []
     for move, row, col in np.argwhere(exists).tolist():
         down, right = MOVES[move]
         to = [(row + i, col + j) for i, j in MOVES]
-        nexts = [n for n, (i, j) in enumerate(to) if around[n, i + 1, j + 1]]
+        nexts = np.flatnonzero(follows[move, row, col, :END]).tolist()
         edge = Edge(
             move,
             left=(row - down, col - right),

@@ -20,10 +20,10 @@ from trustbo.models.backend import VERSIONS
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.simulation.model import ModelSimulator
 from trustbo.simulation.protocol import digest, require_path
-from trustbo.simulation.replicates import END, replicated
+from trustbo.simulation.replicates import replicated
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import MOVES, moves_along
+from trustbo.workspace.moves import END, MOVES, bounds_and_next
 
 
 class Truth(Summary):
@@ -181,10 +181,7 @@ class Truth(Summary):
     def _along(self, path: Sequence[Cell]) -> tuple[np.ndarray, np.ndarray]:
         """Return the contact and the completion probability of a path's bounds, each (bound,)."""
         cells = require_path(self.workspace, path)
-        moves = moves_along(cells)
-        rows, cols = np.array(cells)[1:].T
-
-        where = moves, rows, cols, np.append(moves[1:], END)
+        where = tuple(bounds_and_next(cells).T)
         return self.bounds["contact"].values[where], self.bounds["passed"].values[where]
 
 

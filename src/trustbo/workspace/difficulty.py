@@ -1,71 +1,93 @@
 """Difficulty of bounds, measured on the robots' routes relative to the robots' limits.
 
-Each measure is 0 on easy routes and about 1 at the robots' limit. The measure of a bound is the
-maximum over the routes of the lead and of T2. The routes of T2 depend on the next bound, which is
-assumed to have the same direction.
+Each measure is 0 on easy routes and about 1 at the robots' limit. T2 leaves the bound a -> c for
+the posts from which it watches the lead's next move, so its routes, and with them the difficulty,
+depend on the next move. The measure of a bound with its next move is the maximum over the routes of
+the lead and of T2.
+
+In a bound, next moves with the same tilt share the steepest route, for example that of the lead.
+They pass or fail together, so they are one unit of the hazard model; see `Difficulty.unit`.
 """
 
-import math
 from collections.abc import Sequence
 from itertools import batched
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.kernels import kernel
 from trustbo.parallel import in_order
-from trustbo.terrain.pixels import nearest_pixel
+from trustbo.team import Robot
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES
+from trustbo.workspace.moves import END, MOVES, NEXT_NAMES, possible_next
 from trustbo.workspace.posts import TRAVERSABLE, Posts
+from trustbo.workspace.pursuit import largest_tilt
+from trustbo.workspace.surface import Surface
 
 MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
 """Measures of difficulty; see `difficulty_of`."""
-_AHEAD = 1.5  # distance to the point of the route that a robot faces, m
-_STEP = 0.25  # distance between samples of a route, m
-_SUSTAINED = 4  # number of samples over which the tilt is averaged
+_TILT = MEASURES.index("tilt")
 _WIDTH = 2.0  # distance to an impassable pixel at which narrowness is 0.5, m
 _UNKNOWN = 0.5  # difficulty of routes without known traversability
 _BESIDE = 1.001  # pixels; a route this close to an impassable pixel is beside it
 _MOST = 2.0  # largest value of the measure tilt
 _TIGHT = 3.0  # log(1 + length in m) at which tightness is 1: 19 m
 _BLOCK = 16  # bounds per task of a thread
-_compiled = kernel()
-
-_cached: WeakKeyDictionary[Workspace, xr.DataArray] = WeakKeyDictionary()
+_NONE = -1  # unit of a bound that does not exist
 
 
-def difficulty_of(workspace: Workspace) -> xr.DataArray:
+class Difficulty(NamedTuple):
+    """Difficulty of the bounds of a workspace, with each next move.
+
+    Attributes:
+        measures: DataArray (move, row, col, next_move, measure), NaN where there is no bound or no
+            next bound. Without a terrain, the dimension `measure` has length 0.
+        unit: Index of the first next move of the same bound that has the same tilt, shape (move,
+            row, col, next_move); -1 where there is no bound. Without a terrain, all next moves of a
+            bound are one unit.
+    """
+
+    measures: xr.DataArray
+    unit: np.ndarray
+
+
+_cached: WeakKeyDictionary[Workspace, Difficulty] = WeakKeyDictionary()
+
+
+def difficulty_of(workspace: Workspace) -> Difficulty:
     """Compute the difficulty of a workspace's bounds; the result is cached.
 
     `untraversable` is one minus the mean traversability of a route's pixels, or 0.5 if unknown.
-    `tilt` is the largest tangent of pitch or roll along the route, averaged over 1 m, divided by
-    the tangent of `max_slope`; it is at most 2. The robot faces a point 1.5 m ahead. `narrowness`
-    is 1 / (1 + w / 2 m), where w is the smallest distance to an impassable pixel. `tightness` is
-    log(1 + l / 1 m) / 3, where l is the length of the route beside impassable pixels.
-
-    Returns:
-        DataArray (move, row, col, measure), NaN where there is no bound. Without a terrain, the
-        dimension `measure` has length 0.
+    `tilt` is the largest tangent of pitch or roll on the curve that a robot drives along the route
+    (see `pursuit.largest_tilt`), divided by the tangent of `max_slope`; it is at most 2.
+    `narrowness` is 1 / (1 + w / 2 m), where w is the smallest distance to an impassable pixel.
+    `tightness` is log(1 + l / 1 m) / 3, where l is the length of the route beside impassable
+    pixels. All but the tilt are averaged over the next moves of a unit.
     """
     if workspace not in _cached:
-        exists = workspace.passable_bounds
+        exists = possible_next(workspace.passable_bounds.values)
         posts = workspace.posts
         names = () if posts is None else MEASURES
-        values = np.full((*exists.shape, len(names)), np.nan)
-        if posts is not None:
-            _measure(workspace, posts, exists.values, values)
 
-        coords = {**exists.coords, "measure": list(names)}
-        difficulty = xr.DataArray(values, coords, (*exists.dims, "measure"), "difficulty")
-        _cached[workspace] = difficulty
+        values = np.full((*exists.shape, len(names)), np.nan)
+        unit = np.where(exists, exists.argmax(-1)[..., None], _NONE)
+        if posts is not None:
+            _measure(workspace, posts, exists, values)
+            unit = _units_of(values[..., _TILT], exists)
+            _average(values, unit)
+
+        bounds = workspace.passable_bounds
+        coords = {**bounds.coords, "next_move": list(NEXT_NAMES), "measure": list(names)}
+        dims = *bounds.dims, "next_move", "measure"
+        measures = xr.DataArray(values, coords, dims, "difficulty")
+        _cached[workspace] = Difficulty(measures, unit)
     return _cached[workspace]
 
 
 def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.ndarray) -> None:
-    """Write the measures of existing bounds to `out`, shape (move, row, col, measure)."""
+    """Write the measures of existing bounds to `out`, (move, row, col, next_move, measure)."""
     surface = posts.surface
     pixels = workspace.pixels
 
@@ -80,84 +102,71 @@ def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.nda
     def work(block: Sequence[list[int]]) -> None:
         for m, row, col in block:
             down, right = MOVES[m]
-            cell = row, col
             left = row - down, col - right
-            ahead = row + down, col + right
+            follows = np.flatnonzero(exists[m, row, col]).tolist()
+            measured: dict[bytes, np.ndarray] = {}  # keyed by the robot and its route
+            for n in follows:
+                onward = None if n == END else (row + MOVES[n][0], col + MOVES[n][1])
+                routes = posts.bound_routes(left, (row, col), onward)
+                out[m, row, col, n] = _of_bound(posts, easy, room, routes, measured)
 
-            inside = 0 <= ahead[0] < exists.shape[1] and 0 <= ahead[1] < exists.shape[2]
-            onward = ahead if inside and exists[m, *ahead] else None
-            out[m, row, col] = _of_bound(posts, easy, room, posts.bound_routes(left, cell, onward))
-
-    for _ in in_order(work, batched(np.argwhere(exists).tolist(), _BLOCK)):
+    for _ in in_order(work, batched(np.argwhere(exists.any(-1)).tolist(), _BLOCK)):
         pass
 
 
 def _of_bound(
-    posts: Posts, easy: np.ndarray, room: np.ndarray, routes: Sequence[np.ndarray | None]
+    posts: Posts,
+    easy: np.ndarray,
+    room: np.ndarray,
+    routes: Sequence[np.ndarray | None],
+    measured: dict[bytes, np.ndarray],
 ) -> np.ndarray:
-    """Compute the maximum of each measure over the robots' routes in a bound, shape (measure,)."""
-    surface = posts.surface
-    team = posts.team
-    ground = surface.gradient, surface.pixel, surface.origin
-    robots = team.lead, *team.robots
+    """Compute the maximum of each measure over the robots' routes in a bound, shape (measure,).
+
+    `measured` keeps the measures of each robot's routes, many of which several next moves share.
+    """
+    robots = posts.team.lead, *posts.team.robots
 
     worst = np.zeros(len(MEASURES))
-    for robot, route in zip(robots, routes, strict=True):
+    for i, (robot, route) in enumerate(zip(robots, routes, strict=True)):
         if route is None:
             continue
-
-        pixels = surface.nearest(*route.T)
-        of_route = easy[pixels]
-        gaps = room[pixels]
-        of_route = of_route[np.isfinite(of_route)]
-
-        tight = (gaps <= _BESIDE * max(surface.pixel)).sum() * min(surface.pixel)
-        measures = (
-            1.0 - of_route.mean() if len(of_route) else _UNKNOWN,
-            min(_tilt(route, *ground) / np.tan(robot.max_slope), _MOST),
-            1.0 / (1.0 + gaps.min() / _WIDTH),
-            np.log1p(tight) / _TIGHT,
-        )
-
-        worst = np.maximum(worst, measures)
+        key = bytes([i]) + route.tobytes()
+        if key not in measured:
+            measured[key] = _of_route(posts.surface, easy, room, robot, route)
+        worst = np.maximum(worst, measured[key])
     return worst
 
 
-@_compiled
-def _tilt(way, gradient, pixel, origin):
-    """Compute the largest tangent of pitch or roll on a route (point, 2), averaged over 1 m."""
-    along = np.zeros(len(way))
-    for k in range(1, len(way)):
-        along[k] = along[k - 1] + math.hypot(way[k, 0] - way[k - 1, 0], way[k, 1] - way[k - 1, 1])
+def _of_route(
+    surface: Surface, easy: np.ndarray, room: np.ndarray, robot: Robot, route: np.ndarray
+) -> np.ndarray:
+    """Compute the measures of one robot's route, shape (measure,)."""
+    pixels = surface.nearest(*route.T)
+    of_route = easy[pixels]
+    gaps = room[pixels]
+    of_route = of_route[np.isfinite(of_route)]
+    tight = (gaps <= _BESIDE * max(surface.pixel)).sum() * min(surface.pixel)
 
-    n = int(along[-1] / _STEP) + 1
-    tilt = np.empty(n)
-    sums = np.zeros(n + 1)
-
-    for k in range(n):
-        x, y = _point(way, along, k * _STEP)
-        ahead_x, ahead_y = _point(way, along, k * _STEP + _AHEAD)
-        i, j = nearest_pixel(x, y, origin, pixel, gradient.shape[1:])
-
-        gx = gradient[0, i, j]
-        gy = gradient[1, i, j]
-        heading = math.atan2(ahead_y - y, ahead_x - x)
-
-        east = math.cos(heading)
-        north = math.sin(heading)
-        tilt[k] = max(abs(gx * east + gy * north), abs(gy * east - gx * north))
-        sums[k + 1] = sums[k] + tilt[k]
-
-    m = min(n, _SUSTAINED)
-    return ((sums[m:] - sums[:-m]) / m).max()
+    return np.array([
+        1.0 - of_route.mean() if len(of_route) else _UNKNOWN,
+        min(largest_tilt(surface, robot, route) / np.tan(robot.max_slope), _MOST),
+        1.0 / (1.0 + gaps.min() / _WIDTH),
+        np.log1p(tight) / _TIGHT,
+    ])  # fmt: skip
 
 
-@_compiled
-def _point(way, along, s):
-    """Return the position at distance s along a route, or the end of a shorter route."""
-    k = min(np.searchsorted(along, s, side="right"), len(way) - 1)
-    length = along[k] - along[k - 1]
-    share = min(1.0, (s - along[k - 1]) / length) if length > 0.0 else 1.0
+def _units_of(tilt: np.ndarray, exists: np.ndarray) -> np.ndarray:
+    """Return the first next move with the same tilt, (move, row, col, next_move); -1 if none."""
+    same = tilt[..., None, :] == tilt[..., None]  # NaN equals nothing
+    return np.where(exists, same.argmax(-1), _NONE)
 
-    x = way[k - 1, 0] + share * (way[k, 0] - way[k - 1, 0])
-    return x, way[k - 1, 1] + share * (way[k, 1] - way[k - 1, 1])
+
+def _average(values: np.ndarray, unit: np.ndarray) -> None:
+    """Replace the measures (move, row, col, next_move, measure) by their means over each unit."""
+    for n in range(unit.shape[-1]):
+        member = unit == n
+        alone = member[..., None] & np.isfinite(values)
+        count = np.maximum(alone.sum(-2, keepdims=True), 1)
+        mean = np.where(alone, values, 0.0).sum(-2, keepdims=True) / count
+        values[member] = np.broadcast_to(mean, values.shape)[member]

@@ -11,6 +11,10 @@ MOVES = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 """Steps (down, right) to the neighbouring cells; the reverse of move m is move 7 - m."""
 MOVE_NAMES = ("nw", "n", "ne", "w", "e", "sw", "s", "se")
 """Compass directions of `MOVES`, with row 0 in the north."""
+END = len(MOVES)
+"""Index used instead of the next move for a bound that ends the path."""
+NEXT_NAMES = (*MOVE_NAMES, "end")
+"""Names of the moves that can follow a bound, and `"end"`."""
 
 
 def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -> list[Cell]:
@@ -51,6 +55,30 @@ def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
 def bounds_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
     """Return the move, row and column of each bound of a path, (bound, 3); see `moves_along`."""
     return np.column_stack([moves_along(path), np.asarray(path)[1:]])
+
+
+def bounds_and_next(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
+    """Return the move, row, column and next move of each bound of a path, shape (bound, 4).
+
+    The next move of the last bound is `END`. Raises TrustboError as `moves_along` does.
+    """
+    bounds = bounds_along(path)
+    return np.column_stack([bounds, np.append(bounds[1:, 0], END)])
+
+
+def possible_next(bounds: np.ndarray) -> np.ndarray:
+    """Return whether each bound can be followed by each next move, (move, row, col, next_move).
+
+    Args:
+        bounds: Whether each bound exists, shape (move, row, col).
+    """
+    _, rows, cols = bounds.shape
+    framed = np.pad(bounds, ((0, 0), (1, 1), (1, 1)))
+    onward = [
+        framed[n, 1 + down :, 1 + right :][:rows, :cols] for n, (down, right) in enumerate(MOVES)
+    ]
+    anything = np.ones((rows, cols), bool)  # a path can end in any cell
+    return bounds[..., None] & np.stack([*onward, anything], axis=-1)
 
 
 def existing_bounds(passable: np.ndarray) -> np.ndarray:

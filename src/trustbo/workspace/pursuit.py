@@ -1,0 +1,149 @@
+"""Pure pursuit: the motion of a unicycle robot along a route.
+
+The simulator drives the robots by it, and the difficulty of a bound is measured along the curve
+that a robot drives by it without wheel slip, which cuts the corners of the route.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from trustbo.kernels import PART, kernel
+from trustbo.team import Robot
+from trustbo.terrain.pixels import nearest_pixel
+from trustbo.workspace.routes import SLOWEST, speed_share
+from trustbo.workspace.surface import Surface
+
+LOOKAHEAD = 1.5
+"""Distance in m to the point of the route that a robot steers towards."""
+ARRIVED = 0.5
+"""Distance in m from the goal at which a robot stops."""
+OK = 0
+STUCK = 1
+TIPPED = 2
+TIMEOUT = 3
+STATUS = ("ok", "stuck", "tipped", "timeout")
+"""Statuses in the order of their codes."""
+_LEAST_STEPS = 5
+"""Smallest number of integration steps per tick."""
+_SLIP = 0.05
+"""Standard deviation of the log of the factor by which wheel slip multiplies the speed."""
+_TICK = 0.5
+"""Length of a tick of `largest_tilt`, s."""
+_compiled = kernel()
+_part = njit(nogil=True, error_model="numpy", **PART)
+
+
+def steps_per_tick(robot: Robot, tick: float) -> int:
+    """Return the number of integration steps per tick, so that no step jumps over the goal."""
+    return max(_LEAST_STEPS, math.ceil(robot.speed * tick / (0.5 * ARRIVED)))
+
+
+@_part
+def _squared(route, i, x, y):
+    """Compute the squared distance from (x, y) to point i of a route."""
+    return (route[i, 0] - x) ** 2 + (route[i, 1] - y) ** 2
+
+
+@_part
+def _within_a_turn(angle):
+    """Wrap an angle to [-pi, pi); the remainder is slow and computed only if needed."""
+    if -math.pi <= angle < math.pi:
+        return angle
+    return (angle + math.pi) % (2.0 * math.pi) - math.pi
+
+
+def largest_tilt(surface: Surface, robot: Robot, route: np.ndarray) -> float:
+    """Compute the largest tangent of pitch or roll on the curve that a robot drives.
+
+    There is no wheel slip, and the robot faces its route at the start. The result is inf if the
+    curve leaves the pixels with known slopes.
+    """
+    to_next = route[min(1, len(route) - 1)] - route[0]
+    length = float(np.hypot(*np.diff(route, axis=0).T).sum())
+    slowest = SLOWEST * robot.speed
+    n_ticks = math.ceil((length / slowest + 2.0 * math.pi / robot.turn_rate) / _TICK)
+    _, _, largest = pursue(
+        surface.gradient,
+        surface.pixel,
+        surface.origin,
+        route,
+        math.atan2(to_next[1], to_next[0]),
+        (robot.speed, robot.turn_rate, robot.max_slope, math.inf),
+        _TICK,
+        steps_per_tick(robot, _TICK),
+        np.zeros(n_ticks),
+    )
+    return largest
+
+
+@_compiled
+def pursue(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip):
+    """Integrate the motion of a robot that follows a route, until it arrives or fails.
+
+    Args:
+        gradient: Slopes of the ground towards east and north, shape (2, row, col).
+        pixel: Height and width of a pixel, m.
+        origin: Position of the centre of pixel (0, 0).
+        route: Points of the route, shape (point, 2).
+        heading: Heading at the start, rad.
+        limits: Speed in m/s, turn rate in rad/s, slope limit for the speed in rad, and the tangent
+            of pitch or roll at which the robot fails, which may be infinite.
+        tick: Length of a tick, s.
+        n_steps: Number of integration steps per tick.
+        slip: Standard normal scores of the wheel slip in each tick, shape (tick,).
+
+    Returns:
+        Poses after each tick, shape (tick, 3), the status code, and the largest tangent of pitch or
+        roll on the way, which is inf if the robot got stuck or tipped over.
+    """
+    speed, turn_rate, max_slope, steepest = limits
+    shape = gradient.shape[1:]
+
+    x = route[0, 0]
+    y = route[0, 1]
+    aim = min(1, len(route) - 1)
+    poses = np.empty((len(slip), 3))
+    dt = tick / n_steps
+    largest = 0.0
+
+    for k in range(len(slip)):
+        pace = speed * math.exp(_SLIP * slip[k])
+        for _ in range(n_steps):
+            # Pure pursuit: steer towards a point of the route ahead (Coulter 1992).
+            while aim < len(route) - 1 and _squared(route, aim, x, y) < LOOKAHEAD**2:
+                aim += 1
+
+            dx = route[aim, 0] - x
+            dy = route[aim, 1] - y
+            error = _within_a_turn(math.atan2(dy, dx) - heading)
+            turn = min(turn_rate * dt, max(-turn_rate * dt, error))
+            heading += turn
+
+            i, j = nearest_pixel(x, y, origin, pixel, shape)
+            gx = gradient[0, i, j]
+            gy = gradient[1, i, j]
+
+            ahead = math.cos(heading)
+            left = math.sin(heading)
+            # Tangents of pitch and roll.
+            pitch = abs(gx * ahead + gy * left)
+            roll = abs(gy * ahead - gx * left)
+            if not (roll <= steepest and pitch <= steepest):  # NaN slopes also fail
+                poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
+                return poses[: k + 1], TIPPED if roll > steepest else STUCK, np.inf
+            largest = max(largest, pitch, roll)
+
+            # A skid-steer robot turns on the spot until it faces its route.
+            v = pace * speed_share(math.atan(max(pitch, roll)), max_slope)
+            v *= 1.0 if error == turn else max(0.0, math.cos(error - turn))
+            x += v * dt * ahead
+            y += v * dt * left
+
+            if aim == len(route) - 1 and _squared(route, aim, x, y) < ARRIVED**2:
+                poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
+                return poses[: k + 1], OK, largest
+
+        poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
+    return poses, TIMEOUT, largest
