@@ -103,7 +103,13 @@ def draw_model(rng, z, kind):
 
 
 def draw_risk(rng, shape, of_contact):
-    """Draw failure probabilities (move, row, col), components or None, and planner options."""
+    """Draw failure probabilities, components or None, and planner options.
+
+    The probabilities have shape (move, row, col), or (move, row, col, next_move) in half of the
+    problems, which then depend on the next move.
+    """
+    if rng.random() < 0.5:
+        shape = (*shape, 9)
     p = np.where(rng.random(shape) < 0.4, rng.uniform(0.0, 0.5, shape), 0.02)
     p = np.where(rng.random(shape) < 0.1, rng.choice([0.0, 1.0, 0.1], shape), p)
     components, options = None, {}
@@ -113,7 +119,8 @@ def draw_risk(rng, shape, of_contact):
         options["failure_cost"] = float(pick(rng, 0.0, 0.7, 3.0, 40.0))
     if rng.random() < 0.6:
         n = int(rng.integers(2, 6))
-        severity = np.sort(rng.lognormal(0.0, pick(rng, 0.3, 1.5), n))[:, None, None, None]
+        severity = np.sort(rng.lognormal(0.0, pick(rng, 0.3, 1.5), n))
+        severity = severity.reshape(n, *[1] * len(shape))
         noise = rng.lognormal(0.0, pick(rng, 0.0, 0.0, 1.0), (n, *shape))
         components = Components(
             np.minimum(p * severity * noise, 1.0), rng.dirichlet(np.full(n, 0.7))
@@ -123,11 +130,13 @@ def draw_risk(rng, shape, of_contact):
 
 
 def risks_of(p, components):
-    """Return risks (sum, move, cell) of each component and their shares; of the mean without."""
+    """Return risks (sum, move, cell, next move) of each component, or of the mean, and shares."""
     some, share = (p[None], np.ones(1)) if components is None else components
     with np.errstate(divide="ignore"):
         risk = np.minimum(-np.log1p(-some), 700.0)
-    return risk.reshape(len(some), 8, -1), share
+    if p.ndim == 3:
+        risk = np.repeat(risk[..., None], 9, axis=-1)
+    return risk.reshape(len(some), 8, -1, 9), share
 
 
 def draw_problem(rng):
@@ -159,7 +168,7 @@ def draw_problem(rng):
     )  # fmt: skip
     if closed.any():
         planner = planner.avoiding(closed, np.zeros(closed.shape))
-    risk, share, failure = np.zeros((1, 8, passable.size)), np.ones(1), np.zeros(1)
+    risk, share, failure = np.zeros((1, 8, passable.size, 9)), np.ones(1), np.zeros(1)
     if p is not None:
         planner = planner.with_risk(p, None, components)
         cost = options.get("failure_cost", float(shortest)) if objective == "lost_contact" else 0.0

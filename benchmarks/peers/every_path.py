@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import expit, ndtr
 
 STEPS = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
-NONE = 8  # instead of a move: the walk begins here
+NONE = 8  # instead of a move: the walk begins here, or ends here
 
 
 class World(NamedTuple):
@@ -29,7 +29,7 @@ class World(NamedTuple):
     sd: float
     longest: int
     turns: bool
-    risk: np.ndarray  # (sum, move, cell entered), -log(1 - p)
+    risk: np.ndarray  # (sum, move, cell entered, next move or NONE), -log(1 - p)
     failure: np.ndarray  # (sum,), cost of failing by each sum
     share: np.ndarray  # (sum,), probability of each sum
     limit: float  # on the probability to fail
@@ -77,6 +77,7 @@ def best_walk(world, most):
     cell, came = np.array([world.start]), np.array([NONE])
     x, risk = world.x0[:, None], np.zeros((len(world.risk), 1))
     cost, bound_cost, scores, sums, total = np.zeros(1), np.zeros(1), [], [], 0
+    begun = np.pad(world.risk, ((0, 0), (0, 1), (0, 0), (0, 0)))  # nothing is at risk before NONE
     for k in range(1, world.longest + 1):
         m, walk = np.nonzero(world.into[:, cell] >= 0)
         other = world.into[m, cell[walk]]
@@ -90,10 +91,12 @@ def best_walk(world, most):
         x = world.B0 @ x[:, walk] + world.u[:, m, other]
         last = world.loss(x.mean(0))
         cost, bound_cost = cost[walk] + last, bound_cost[walk] + world.bound_cost[m, other]
-        risk = risk[:, walk] + world.risk[:, m, other]
+        # What is at risk in a bound depends on the next move, which is known only now.
+        risk = risk[:, walk] + begun[:, came[walk], cell[walk], m]
         cell, came, there = other, m, other == world.goal
-        scores.append(world.score(cost, last, bound_cost, risk, k)[there])
-        sums.append(-np.tensordot(world.share, np.expm1(-risk[:, there]), 1))
+        ended = risk + world.risk[:, m, other, NONE]
+        scores.append(world.score(cost, last, bound_cost, ended, k)[there])
+        sums.append(-np.tensordot(world.share, np.expm1(-ended[:, there]), 1))
         on = ~there
         cell, came, x, risk = cell[on], came[on], x[:, on], risk[:, on]
         cost, bound_cost = cost[on], bound_cost[on]
@@ -112,10 +115,13 @@ def score_along(world, path):
         entering = np.flatnonzero(world.into[:, a] == c)
         if not len(entering) or (not world.turns and came != NONE and entering[0] == 7 - came):
             return -np.inf
+        if came != NONE:
+            risk = risk + world.risk[:, came, a, entering[0]]
         came = entering[0]
         x = world.B0 @ x + world.u[:, came, c]
         costs.append(world.loss(x.mean()))
-        risk, bound_cost = risk + world.risk[:, came, c], bound_cost + world.bound_cost[came, c]
+        bound_cost = bound_cost + world.bound_cost[came, c]
+    risk = risk + world.risk[:, came, path[-1], NONE]
     if len(costs) > world.longest or -world.share @ np.expm1(-risk) > world.limit:
         return -np.inf
     return world.score(sum(costs), costs[-1], bound_cost, risk, len(costs))

@@ -143,14 +143,18 @@ def prior_betas(
     """
     logit = weights[:, :1] + weights[:, 1:] @ difficulty.T
     fails = special.expit(logit)
-    passes = special.expit(-logit)
+    passes = 1.0 - fails  # rounds to 0 below 1e-16, where FLOOR applies anyway
 
     if steepness is not None:
-        beyond = (steepness + limit[:, :1]) / limit[:, 1:]
-        fails = fails + passes * special.expit(beyond)
-        passes = passes * special.expit(-beyond)
+        of_limit = special.expit((steepness + limit[:, :1]) / limit[:, 1:])
+        fails += passes * of_limit
+        passes *= 1.0 - of_limit
 
-    return strength[:, None] * fails + FLOOR, strength[:, None] * passes + FLOOR
+    fails *= strength[:, None]
+    passes *= strength[:, None]
+    fails += FLOOR
+    passes += FLOOR
+    return fails, passes
 
 
 def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:

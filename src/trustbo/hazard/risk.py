@@ -67,6 +67,7 @@ class BoundRisk(Summary):
                 "again with the missions; posteriors of trustbo 0.4 have no next moves."
             )
 
+        self._mean = hazard["p_fail"].values if "p_fail" in hazard else None
         self.exists = difficulty.unit >= 0
         self.trials = hazard["trials"].values
         self.failures = hazard["failures"].values
@@ -136,6 +137,9 @@ class BoundRisk(Summary):
     @cached_property
     def mean(self) -> np.ndarray:
         """Posterior mean of the failure probability, shape (move, row, col, next_move)."""
+        if self._mean is not None:
+            return self._mean
+
         mean = np.empty(len(self._trials))
         for units, a, b in self._betas():
             mean[units] = (a / (a + b)).mean(0)
@@ -224,8 +228,8 @@ class BoundRisk(Summary):
         )
 
         failed = self._failures[units]
-        a = a + failed
-        b = b + self._trials[units] - failed
+        a += failed
+        b += self._trials[units] - failed
 
         n_units = len(self._trials)
         position = np.full(n_units + 1, -1)  # the last stands for bounds that do not exist
