@@ -14,7 +14,7 @@ from trustbo.hazard.model import fit_hazard, impute, sample
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import LostMission, Trials
 from trustbo.workspace.difficulty import difficulty_of
-from trustbo.workspace.moves import END, MOVES, bounds_and_next
+from trustbo.workspace.moves import END, MOVES
 
 
 def workspace(n=3):

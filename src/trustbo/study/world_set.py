@@ -17,6 +17,8 @@ _SYNTHETIC = tuple(f"synthetic-{seed}" for seed in range(3))
 _ALDER = "synthetic-alder"
 _BIRCH = "synthetic-birch"
 _CEDAR = "synthetic-cedar"
+_OF_14 = ("synthetic-0", "synthetic-1", _BIRCH, _CEDAR)
+"""Synthetic terrains on which robots with a slope limit of 14 degrees can complete both courses."""
 _AFTER = 6
 """Index of the first mission after a change of the world, the seventh mission."""
 _DAYS = (1, 3, 4, 7)
@@ -114,11 +116,11 @@ def _season(factor: float) -> dict[str, Any]:
     return {"events": (Season(factor, first=_AFTER),)}
 
 
-# In the kind "limit", the assumed slope limit is too high. In "limit-4", the assumed limit is 4
-# degrees above the true limit of 14, 18, 22 or 26 degrees. The true limit is the lowest at which
-# both diagonal courses have a path that arrives and at least 5 % of the bounds fail. Wellington and
-# synthetic-2 have no such limit. In "limit-1", the assumed limit is 18 degrees, as in the kind
-# "slopes", or 45 degrees, the default, on wellington.
+# In the kind "limit", the assumed slope limit is wrong: 1, 2 or 4 degrees too high, or 3 too low.
+# The true limit is the lowest of 14, 18, 22 and 26 degrees at which both diagonal courses have a
+# path that arrives and at least 5 % of the bounds fail. Wellington and synthetic-2 have no such
+# limit. Only the real terrains of "limit-1" have other limits: the assumed one is 18 degrees, as
+# in the kind "slopes", or 45 degrees, the default, on wellington.
 _CASES: tuple[_Case, ...] = (
     ("right", "", (*_SYNTHETIC, *REAL), {}),
     ("wall", "wall", ("synthetic-0", "synthetic-1", "tahoe"), {"sight": Sight(math.inf, 0.0)}),
@@ -157,6 +159,11 @@ _CASES: tuple[_Case, ...] = (
     ("limit", "limit-4", ("bcts",), _limit(26.0, 30.0)),
     ("limit", "limit-1", ("tahoe", "topography"), _limit(17.0, 18.0)),
     ("limit", "limit-1", ("wellington",), _limit(44.0, 45.0)),
+    ("limit", "limit-1", _OF_14, _limit(14.0, 15.0)),
+    ("limit", "limit-2", _OF_14, _limit(14.0, 16.0)),
+    ("limit", "limit-2", ("tahoe", "topography"), _limit(22.0, 24.0)),
+    ("limit", "limit-low-3", _OF_14, _limit(14.0, 11.0)),
+    ("limit", "limit-low-3", ("tahoe", "topography"), _limit(22.0, 19.0)),
 )  # fmt: skip
 
 

@@ -10,9 +10,10 @@ import math
 from typing import Any
 
 import numpy as np
+from numba import njit
 from scipy import ndimage
 
-from trustbo.kernels import kernel
+from trustbo.kernels import PART, kernel
 from trustbo.parallel import plain
 from trustbo.team import Robot
 from trustbo.terrain.pixels import nearest_pixel
@@ -26,6 +27,7 @@ _CLEARANCE = 1.0  # preferred distance from obstacles, because robots stray from
 _TIE = 1e-9  # m on level ground; costs that differ by less are equal but for rounding
 _CLOSE = 4.0  # factor on the cost of a route that is closer to an obstacle
 _compiled = kernel()
+_part = njit(nogil=True, error_model="numpy", **PART)
 
 
 class Routes:
@@ -94,6 +96,19 @@ def speed_share(tilt, max_slope):
     return np.maximum(SLOWEST, 1.0 - (1.0 - SLOWEST) * tilt / max_slope)
 
 
+@_part
+def _shortest(rows, cols, pixel):
+    """Compute the length of the shortest way over a number of rows and columns of pixels.
+
+    A way leads from a pixel to one of its 8 neighbours, so it is longer than a straight line.
+    """
+    down = abs(rows)
+    right = abs(cols)
+    diagonal = min(down, right)
+    straight = (down - diagonal) * pixel[0] + (right - diagonal) * pixel[1]
+    return diagonal * math.hypot(pixel[0], pixel[1]) + straight
+
+
 @_compiled
 def a_star(pace, pixel, start, goal):
     """Find the pixels of the fastest route by A* (Hart, Nilsson and Raphael 1968).
@@ -116,8 +131,7 @@ def a_star(pace, pixel, start, goal):
         if (r, c) == goal:
             break
 
-        # Admissible estimate: a straight line at the best pace.
-        ahead = math.hypot((goal[0] - r) * pixel[0], (goal[1] - c) * pixel[1]) * least
+        ahead = _shortest(goal[0] - r, goal[1] - c, pixel) * least  # an admissible estimate
         if estimate > best[r, c] + ahead + _TIE:
             continue  # a stale entry: a faster way to the pixel was found
         for dr in range(-1, 2):
@@ -136,7 +150,7 @@ def a_star(pace, pixel, start, goal):
                 if cost < best[i, j]:
                     best[i, j] = cost
                     came[i, j] = r * cols + c
-                    rest = math.hypot((goal[0] - i) * pixel[0], (goal[1] - j) * pixel[1])
+                    rest = _shortest(goal[0] - i, goal[1] - j, pixel)
                     heapq.heappush(queue, (cost + rest * least, i, j))
 
     if not np.isfinite(best[goal]):
