@@ -11,11 +11,15 @@ their predicted arrival probability with the fraction of simulated runs that arr
 the product of 1 - p_fail over the bounds. Each campaign has a file in --out, so the script can be
 resumed. --jobs sets the number of processes.
 
+The part `separation` simulates all bounds with all next moves in the worlds whose slope limit is 2
+degrees too high, and prints how well several measures of tilt separate those that fail.
+
 The part `price` prints the failure probability of plans on wellington, computed from the product of
 means, from components, and from all draws.
 """
 
 import csv
+import dataclasses
 import json
 import multiprocessing
 import warnings
@@ -30,8 +34,11 @@ import trustbo as tb
 from trustbo.hazard import Hazard
 from trustbo.hazard.risk import Risk
 from trustbo.simulation import KinematicSimulator
+from trustbo.simulation.replicates import replicated
+from trustbo.study import worlds
 from trustbo.study.world import COURSES, World
-from trustbo.workspace.moves import moves_along
+from trustbo.workspace.difficulty import difficulty_of
+from trustbo.workspace.moves import END, MOVES, bounds_and_next
 
 GROUNDS = (("topography", 18), ("tahoe", 18), ("synthetic-0", 14), ("wellington", 38))
 WORLDS = [f"{ground}:{limit}:{excess}" for ground, limit in GROUNDS for excess in (0, 4)]
@@ -175,14 +182,105 @@ def chances(risk, path):
     """Compute the failure probability of a path from means, components, and 20 000 draws."""
     risks = Risk(risk.mean), Risk(risk.mean, components=risk.components())
     joint = [one.failure(path) for one in risks]
-    rows, cols = np.array(path[1:]).T
-    drawn = risk.draw(20_000, seed=1)[:, moves_along(path), rows, cols]
+    drawn = risk.draw(20_000, seed=1)[:, *bounds_and_next(path).T]
     return [f"{p:.3f}" for p in (*joint, 1.0 - np.prod(1.0 - drawn, axis=1).mean())]
+
+
+LOOKAHEADS = (0.5, 3.0)
+"""True look-aheads, m, of robots for which 1.5 m is assumed."""
+
+
+def print_separation(given):
+    """Print the area under the ROC curve of the predicted tilt as a sign of failure, by world.
+
+    The tilt is that of the route, as in version 0.4, or that of the driven curve, and that of the
+    true next move, or that of the next move in the same direction. An area of .5 means that it says
+    nothing about failures.
+    """
+    chosen = [w for w in worlds(given.data).values() if w.case == "limit-2"]
+    chosen = [world for world in chosen if given.data or world.is_packaged]
+    columns = ["route, straight on", "route", "curve, straight on", "curve"]
+    others = [f"curve, {ahead:g} m" for ahead in LOOKAHEADS]
+    table = Table("world", "passed", *columns, *others)
+    areas = []
+    for world in chosen[: 1 if given.quick else None]:
+        simulator = world.simulator(world.workspace())
+        passed = share_passed(simulator)
+        curve = difficulty_of(simulator.workspace).measures.sel(measure="tilt").values
+        route = route_tilts(simulator.workspace, np.isfinite(passed))
+        of_world = [
+            area_under(tilt, passed)
+            for tilt in (straight_on(route), route, straight_on(curve), curve)
+        ]
+        for ahead in LOOKAHEADS:
+            team = world.team
+            robot = dataclasses.replace(team.lead, lookahead=ahead)
+            other = dataclasses.replace(team, lead=robot, robots=(robot,) * team.n_robots)
+            simulator = dataclasses.replace(world, team=other).simulator(simulator.workspace)
+            of_world.append(area_under(curve, share_passed(simulator)))
+        areas.append(of_world)
+        table.row(world.name, f"{np.nanmean(passed):.3f}", *(f"{a:.3f}" for a in of_world))
+    table.row("mean", "", *(f"{a:.3f}" for a in np.mean(areas, axis=0)))
+
+
+def share_passed(simulator, n=4):
+    """Simulate all bounds; return the share that passed, (move, row, col, next_move)."""
+    return replicated(simulator, 0, n, seed=5)["passed"].values
+
+
+def straight_on(tilt):
+    """Give all next moves of a bound the tilt of the one in the same direction, or of the end."""
+    same = np.stack([tilt[m, ..., m] for m in range(len(MOVES))])
+    same = np.where(np.isfinite(same), same, tilt[..., END])
+    return np.broadcast_to(same[..., None], tilt.shape)
+
+
+def route_tilts(workspace, exists):
+    """Compute the largest tilt on the robots' routes, averaged over 1 m, as in version 0.4."""
+    posts = workspace.posts
+    tilts, known = np.full(exists.shape, np.nan), {}
+    for m, row, col, after in np.argwhere(exists).tolist():
+        cell, left = (row, col), (row - MOVES[m][0], col - MOVES[m][1])
+        ahead = None if after == END else (row + MOVES[after][0], col + MOVES[after][1])
+        worst = 0.0
+        for route in posts.bound_routes(left, cell, ahead):
+            key = route.tobytes()
+            if key not in known:
+                known[key] = route_tilt(posts.surface, route)
+            worst = max(worst, known[key])
+        tilts[m, row, col, after] = worst
+    return tilts
+
+
+def route_tilt(surface, route, step=0.25, ahead=1.5, n=4):
+    """Largest tangent of pitch or roll on one route, if the robot faces a point 1.5 m ahead."""
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(route, axis=0).T))])
+    s = np.arange(0.0, along[-1] + 1e-9, step)
+    here, there = (
+        np.stack([np.interp(at, along, axis) for axis in route.T]) for at in (s, s + ahead)
+    )
+    heading = np.arctan2(*(there - here)[::-1])
+    east, north = np.cos(heading), np.sin(heading)
+    gx, gy = surface.gradient[:, *surface.nearest(*here)]
+    tilt = np.maximum(np.abs(gx * east + gy * north), np.abs(gy * east - gx * north))
+    n = min(n, len(tilt))
+    return np.convolve(tilt, np.full(n, 1.0 / n), mode="valid").max()
+
+
+def area_under(tilt, passed):
+    """Probability that a bound that failed has a larger tilt than one that passed."""
+    known = np.isfinite(tilt) & np.isfinite(passed)
+    values, index = np.unique(tilt[known], return_inverse=True)
+    share = passed[known]
+    fails, passes = (np.bincount(index, w, len(values)) for w in (1.0 - share, share))
+    below = np.cumsum(passes) - 0.5 * passes
+    return float(fails @ below / (fails.sum() * passes.sum()))
 
 
 def main():
     parser = arguments(
-        __doc__, names=["reliability", "price"], data=True, seeds=3, out="out/failures",
+        __doc__, names=["reliability", "separation", "price"], data=True, seeds=3,
+        out="out/failures",
         quick="one course, one seed and ten runs per plan",
     )  # fmt: skip
     parser.add_argument("--worlds", nargs="*", default=WORLDS)
@@ -198,6 +296,8 @@ def main():
     names = [n for n in given.worlds if given.data or n.startswith("synthetic")]
     if "price" in given.names:
         print_price()
+    if "separation" in given.names:
+        print_separation(given)
     if "reliability" in given.names:
         print_reliability(reliability(names, given))
 

@@ -233,6 +233,7 @@ def of_team() -> list[Call]:
     numbers = {
         "speed": 2.0,
         "turn_rate": 1.0,
+        "lookahead": 1.5,
         "lidar_range": 100.0,
         "vertical_fov": 0.3,
         "sensor_height": 1.0,

@@ -36,6 +36,8 @@ class Robot:
             (0, 1].
         acquire: Number of successive scans that must detect a target before contact begins.
         drop: Number of successive scans that must miss it before contact ends.
+        lookahead: Distance to the point of its route that the robot steers towards, m. A longer one
+            cuts corners more, so that the robot drives over other ground than its route.
 
     Raises:
         TrustboError: A value is not positive, an angle exceeds 90 degrees, a fraction exceeds 1, or
@@ -55,6 +57,7 @@ class Robot:
     detection: float = 1.0
     acquire: int = 1
     drop: int = 1
+    lookahead: float = 1.5
 
     def __post_init__(self) -> None:
         for name, value in list(vars(self).items()):

@@ -1,10 +1,15 @@
 """Drives along routes, against their kinematics."""
 
+import itertools
+
 import numpy as np
 import pytest
+from scipy import ndimage
+from worlds import Steady
 
 from trustbo.simulation.motion import drive
 from trustbo.team import Robot
+from trustbo.workspace.pursuit import largest_tilt
 from trustbo.workspace.routes import Routes
 from trustbo.workspace.surface import Surface
 
@@ -46,6 +51,35 @@ def test_a_pitch_beyond_the_limit_sticks_and_a_roll_tips(dz_dx, dz_dy, status):
     route = np.array([[10.0, -30.0], [40.0, -30.0]])
     _, found = drive(surface, Robot(), route, 0.0, 0.5, 1000, np.random.default_rng(0))
     assert found == status
+
+
+def test_a_longer_look_ahead_cuts_corners_more():
+    surface = flat_surface()
+    route = np.array([[10.0, -30.0], [30.0, -30.0], [30.0, -50.0]])
+    passed = []
+    for lookahead in (0.5, 1.5, 4.0):
+        fine = np.concatenate([np.linspace(p, q, 81) for p, q in itertools.pairwise(route)])
+        robot = Robot(lookahead=lookahead)
+        poses, status = drive(surface, robot, fine, 0.0, 0.1, 2000, np.random.default_rng(0))
+        assert status == "ok"
+        passed.append(np.hypot(*(poses[:, :2] - route[1]).T).min())
+    assert passed[0] < passed[1] < passed[2]
+    assert passed[0] < 0.5
+    assert 1.0 < passed[2] < 4.0
+
+
+def test_the_largest_tilt_is_that_of_a_drive_without_slip():
+    """On ground that undulates, at every tenth of a second, by the slopes under the robot."""
+    rng = np.random.default_rng(1)
+    surface = flat_surface()
+    surface.gradient[:] = ndimage.gaussian_filter(rng.normal(size=(2, 60, 60)), (0, 4, 4))
+    route = np.array([[10.0, -20.0], [30.0, -30.0], [45.0, -12.0]])
+    poses, _ = drive(surface, Robot(), route, np.arctan2(-10.0, 20.0), 0.1, 2000, Steady())
+    slopes = surface.gradient[:, *surface.nearest(*poses[:, :2].T)]
+    heading = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
+    left = np.stack([-heading[1], heading[0]])
+    tilts = [np.abs((slopes * axis).sum(0)).max() for axis in (heading, left)]
+    assert largest_tilt(surface, Robot(), route) == pytest.approx(max(tilts), rel=0.03)
 
 
 def test_steeper_is_slower():

@@ -29,13 +29,15 @@ def drive(
 
     Returns the poses (x, y, heading) after each tick, shape (tick, 3), and the status.
     """
+    steepest = math.tan(robot.max_slope)
+    limits = robot.speed, robot.turn_rate, robot.lookahead, robot.max_slope, steepest
     poses, code, _ = pursue(
         surface.gradient,
         surface.pixel,
         surface.origin,
         route,
         heading,
-        (robot.speed, robot.turn_rate, robot.max_slope, math.tan(robot.max_slope)),
+        limits,
         tick,
         steps_per_tick(robot, tick),
         rng.standard_normal(max_ticks),

@@ -15,8 +15,6 @@ from trustbo.terrain.pixels import nearest_pixel
 from trustbo.workspace.routes import SLOWEST, speed_share
 from trustbo.workspace.surface import Surface
 
-LOOKAHEAD = 1.5
-"""Distance in m to the point of the route that a robot steers towards."""
 ARRIVED = 0.5
 """Distance in m from the goal at which a robot stops."""
 OK = 0
@@ -70,7 +68,7 @@ def largest_tilt(surface: Surface, robot: Robot, route: np.ndarray) -> float:
         surface.origin,
         route,
         math.atan2(to_next[1], to_next[0]),
-        (robot.speed, robot.turn_rate, robot.max_slope, math.inf),
+        (robot.speed, robot.turn_rate, robot.lookahead, robot.max_slope, math.inf),
         _TICK,
         steps_per_tick(robot, _TICK),
         np.zeros(n_ticks),
@@ -88,8 +86,8 @@ def pursue(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip)
         origin: Position of the centre of pixel (0, 0).
         route: Points of the route, shape (point, 2).
         heading: Heading at the start, rad.
-        limits: Speed in m/s, turn rate in rad/s, slope limit for the speed in rad, and the tangent
-            of pitch or roll at which the robot fails, which may be infinite.
+        limits: Speed in m/s, turn rate in rad/s, look-ahead in m, slope limit for the speed in rad,
+            and the tangent of pitch or roll at which the robot fails, which may be infinite.
         tick: Length of a tick, s.
         n_steps: Number of integration steps per tick.
         slip: Standard normal scores of the wheel slip in each tick, shape (tick,).
@@ -98,7 +96,7 @@ def pursue(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip)
         Poses after each tick, shape (tick, 3), the status code, and the largest tangent of pitch or
         roll on the way, which is inf if the robot got stuck or tipped over.
     """
-    speed, turn_rate, max_slope, steepest = limits
+    speed, turn_rate, lookahead, max_slope, steepest = limits
     shape = gradient.shape[1:]
 
     x = route[0, 0]
@@ -112,7 +110,7 @@ def pursue(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip)
         pace = speed * math.exp(_SLIP * slip[k])
         for _ in range(n_steps):
             # Pure pursuit: steer towards a point of the route ahead (Coulter 1992).
-            while aim < len(route) - 1 and _squared(route, aim, x, y) < LOOKAHEAD**2:
+            while aim < len(route) - 1 and _squared(route, aim, x, y) < lookahead**2:
                 aim += 1
 
             dx = route[aim, 0] - x
