@@ -1,6 +1,6 @@
-"""Paired comparisons of methods by group and kind of world, and comparison with version 0.3.
+"""Paired comparisons of methods by group and kind of world, and comparison with version 0.4.
 
-    python benchmarks/groups.py [FILE]   # by default, the stored table of version 0.4
+    python benchmarks/groups.py [FILE]   # by default, the stored table of version 0.5
 
 The results are from benchmarks/worlds.py. A row (see `rows_of`) is the mean over seeds of one
 method on one world and course. `lost` is the contact lost while learning, in bounds per mission;
@@ -38,12 +38,10 @@ GROUPS = {
 """Kinds of worlds in each group, keyed by the name of the group."""
 LOST = "lost_with_failures"
 COLUMNS = ["lost_while_learning", "regret_now", "arrive", LOST, "arrive_first_3", "arrive_later"]
-"""Quantities of a row; only the first three are available for version 0.3."""
-REFERENCES = [
-    Path(__file__).parent / "reference" / name for name in ("worlds_0.3.csv", "limits_0.3.csv")
-]
-DEAD = "dead-detector"
-"""Case of the kind `change` that is also compared with version 0.3 separately."""
+"""Quantities of a row."""
+STORED = Path(__file__).parent / "reference" / "worlds_0.5.csv"
+BEFORE = Path(__file__).parent / "reference" / "worlds_0.4.csv"
+"""Rows of version 0.4, on the worlds that it knew."""
 
 
 NAMES = {
@@ -59,14 +57,6 @@ def rows_of(numbers: pd.DataFrame) -> pd.DataFrame:
     rows = numbers.rename(columns=NAMES)
     labels = ["world", "kind", "course", "method"]
     return rows.groupby(labels, as_index=False)[COLUMNS].mean()
-
-
-def references() -> pd.DataFrame:
-    """Read the rows of version 0.3, with NaN for quantities that are not available.
-
-    Except for the kind `limit`, the contact lost excludes failures, as trustbo had none there.
-    """
-    return pd.concat([pd.read_csv(file) for file in REFERENCES if file.is_file()])
 
 
 def grounds_of(names: Iterable[str]) -> np.ndarray:
@@ -169,36 +159,35 @@ def arrivals(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.groupby(["kind", "method"])[["arrive", "arrive_first_3", "arrive_later"]].mean()
 
 
-def beside(rows: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
-    """Compute the contact lost now minus that of version 0.3, on the same worlds and courses.
+def by_limit(rows: pd.DataFrame) -> pd.DataFrame:
+    """Average `lost` and the fraction of missions that arrive, by how wrong the slope limit is."""
+    limits = rows[rows["kind"] == "limit"]
+    case = limits["world"].str.extract(r"-(limit-(?:low-)?\d)$", expand=False).rename("case")
+    return limits.groupby([case, limits["method"]])[[LOST, "arrive"]].mean()
 
-    Failures count as lost contact if the reference includes failures (kind `limit`).
-    """
+
+def beside(rows: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
+    """Compute the contact lost now minus that of version 0.4, on the same worlds and courses."""
     ours = [table[table["method"] == OURS] for table in (rows, reference)]
-    both = ours[0].merge(ours[1], on=["world", "kind", "course"], suffixes=("", "_0.3"))
-    old = both[f"{LOST}_0.3"] if f"{LOST}_0.3" in both else pd.Series(np.nan, both.index)
-    known = old.notna()
-    both["now"] = both[LOST].where(known, both["lost_while_learning"])
-    both["before"] = old.where(known, both["lost_while_learning_0.3"])
+    both = ours[0].merge(ours[1], on=["world", "kind", "course"], suffixes=("", "_0.4"))
     table = []
-    selected = {name: (kinds, "") for name, kinds in GROUPS.items()}
-    selected |= {kind: ((kind,), "") for kind in KINDS}
-    selected[f"change: {DEAD}"] = ("change",), DEAD
-    for name, (kinds, case) in selected.items():
-        some = both[both["kind"].isin(kinds) & both["world"].str.endswith(case)]
+    for name, kinds in (GROUPS | {kind: (kind,) for kind in KINDS}).items():
+        some = both[both["kind"].isin(kinds)]
         if some.empty:
             continue
-        less = (some["now"] - some["before"]).to_numpy()
+        less = (some[LOST] - some[f"{LOST}_0.4"]).to_numpy()
         found = clustered(less, grounds_of(some["world"]))
-        arrive = some["arrive_0.3"].mean(), some["arrive"].mean()
-        means = some["before"].mean(), some["now"].mean()
-        table.append([name, some["world"].nunique(), *means, *found, *arrive])
-    head = ["what", "n", "0.3", "now", "value", "low", "high", "p", "home_0.3", "home"]
+        means = some[f"{LOST}_0.4"].mean(), some[LOST].mean()
+        regret = some["regret_now_0.4"].mean(), some["regret_now"].mean()
+        arrive = some["arrive_0.4"].mean(), some["arrive"].mean()
+        table.append([name, some["world"].nunique(), *means, *found, *regret, *arrive])
+    head = ["what", "n", "0.4", "now", "value", "low", "high", "p"]
+    head += ["regret_0.4", "regret", "arrive_0.4", "arrive"]
     return pd.DataFrame(table, columns=head)
 
 
 def report_groups(rows: pd.DataFrame) -> None:
-    """Print Markdown tables by group and kind, of arrivals, and compared with version 0.3."""
+    """Print Markdown tables by group and kind, of arrivals, and compared with version 0.4."""
     print("\n**Lost while learning, with failures**: bounds per mission, by group\n")
     groups = by_group(rows)
     table = Table("group (worlds)", "method", "lost [95 % by terrain]")
@@ -225,16 +214,26 @@ def report_groups(rows: pd.DataFrame) -> None:
         ):
             cells = [f"{home.loc[('limit', name), column]:.3f}" for name in methods]
             table.row(f"limit, {part}", *cells)
-    reference = references()
-    if (compared := beside(rows, reference)).empty:
+    limits = by_limit(rows)
+    if not limits.empty:
+        print("\n**Wrong slope limits**: lost, and fraction of missions that arrive\n")
+        table = Table("limit", *(f"{name}: lost, arrive" for name in methods))
+        for case in limits.index.levels[0]:
+            found = [limits.loc[(case, name)] for name in methods]
+            table.row(case, *(f"{one[LOST]:.3f}, {one['arrive']:.3f}" for one in found))
+
+    if (compared := beside(rows, pd.read_csv(BEFORE))).empty:
         return
-    print(f"\n**{OURS} compared with version 0.3**: lost on the same worlds and courses\n")
-    table = Table("worlds", "0.3", "now", "difference [95 %]", "p", "home, 0.3", "home")
+    print(f"\n**{OURS} compared with version 0.4**: lost on the same worlds and courses\n")
+    pairs = ("0.4", "now"), ("regret_0.4", "regret"), ("arrive_0.4", "arrive")
+    table = Table(
+        "worlds", "0.4", "now", "difference [95 %]", "p", "final regret (%), 0.4", "now",
+        "arrive, 0.4", "now",
+    )  # fmt: skip
     for _, row in compared.iterrows():
-        means = [f"{row[name]:.3f}" for name in ("0.3", "now")]
-        home_of = [f"{row[name]:.3f}" for name in ("home_0.3", "home")]
+        means, regret, arrive = ([f"{row[name]:.3f}" for name in pair] for pair in pairs)
         what = f"{row['what']} ({row['n']})"
-        table.row(what, *means, interval(row, 3), f"{row['p']:.3g}", *home_of)
+        table.row(what, *means, interval(row, 3), f"{row['p']:.3g}", *regret, *arrive)
 
 
 def interval(row: object, places: int) -> str:
@@ -247,5 +246,4 @@ def interval(row: object, places: int) -> str:
 
 
 if __name__ == "__main__":
-    stored = Path(__file__).parent / "reference" / "worlds_0.4.csv"
-    report_groups(pd.read_csv(sys.argv[1] if len(sys.argv) > 1 else stored))
+    report_groups(pd.read_csv(sys.argv[1] if len(sys.argv) > 1 else STORED))

@@ -13,6 +13,7 @@ from groups import (
     beside,
     by_group,
     by_kind,
+    by_limit,
     clustered,
     grounds_of,
     holm,
@@ -162,18 +163,22 @@ def test_rows_count_arrivals_of_the_first_three_missions_apart():
     assert home.loc[("right", OURS), "arrive_later"] == 1.0
 
 
-def test_version_0_3_is_compared_on_the_worlds_that_both_have():
-    """Without failures, which its rows of most kinds lack, and with them for kind limit."""
+def test_version_0_4_is_compared_on_the_worlds_that_both_have():
     rows = made(lambda method, world, course: 0.2)
-    rows[LOST] += 5.0 * (rows["kind"] != "limit")
-    before = made(lambda method, world, course: 0.5).drop(columns=[LOST])
+    before = made(lambda method, world, course: 0.5)
     before = before[before["world"] != "tahoe"]
-    before[LOST] = np.where(before["kind"] == "limit", 0.7, np.nan)
     table = beside(rows, before)
     assert of_row(table, what="right")["n"] == sum(w.kind == "right" for w in worlds().values()) - 1
     assert of_row(table, what="right")["value"] == pytest.approx(-0.3)
-    assert of_row(table, what="change: dead-detector")["n"] == 3
-    assert of_row(table, what="limit")["value"] == pytest.approx(-0.5)
+    assert of_row(table, what="limit")["0.4"] == pytest.approx(0.5)
+
+
+def test_wrong_limits_are_averaged_by_how_wrong_they_are():
+    rows = made(lambda method, world, course: 0.1 if world.case == "limit-low-3" else 0.6)
+    limits = by_limit(rows)
+    assert limits.index.levels[0].tolist() == ["limit-1", "limit-2", "limit-4", "limit-low-3"]
+    assert limits.loc[("limit-low-3", OURS), LOST] == pytest.approx(0.1)
+    assert limits.loc[("limit-2", OURS), LOST] == pytest.approx(0.6)
 
 
 def test_the_report_has_every_group_and_kind(capsys):
