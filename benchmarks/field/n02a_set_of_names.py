@@ -33,7 +33,7 @@ def done(right, line):
 import subprocess
 
 SCRIPT = """
-from trustbo.inference.functions.function import fingerprint
+from trustbo.inference.functions.identity import fingerprint
 USED = {"slope", "openness", "roughness", "sight"}
 def model(awareness, contact_rate=None):
     return [awareness[..., m] for m, name in enumerate(("slope", "tri")) if name in USED]

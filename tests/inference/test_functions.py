@@ -22,12 +22,8 @@ from trustbo.errors import PosteriorError
 from trustbo.inference import params_of
 from trustbo.inference.functions.data import data_of
 from trustbo.inference.functions.fit import _judge as judge
-from trustbo.inference.functions.function import (
-    as_model,
-    constants_of,
-    fingerprint,
-    model_of_record,
-)
+from trustbo.inference.functions.function import as_model, model_of_record
+from trustbo.inference.functions.identity import constants_of, fingerprint
 from trustbo.inference.functions.nuts import Samples
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.backend import own_settings
@@ -680,7 +676,7 @@ def test_globals_that_change_change_the_fingerprint(monkeypatch):
 
 def test_a_fingerprint_without_source_is_the_same_in_other_processes():
     script = (
-        "from trustbo.inference.functions.function import fingerprint as f\n"
+        "from trustbo.inference.functions.identity import fingerprint as f\n"
         "space = {}\n"
         "exec('def m(awareness, contact_rate=None): return (lambda x: x)(1)', space)\n"
         "print(f(space['m']))"
@@ -692,7 +688,7 @@ def test_a_fingerprint_without_source_is_the_same_in_other_processes():
 def test_a_fingerprint_of_sets_is_the_same_in_other_processes():
     script = (
         "from types import SimpleNamespace\n"
-        "from trustbo.inference.functions.function import fingerprint as f\n"
+        "from trustbo.inference.functions.identity import fingerprint as f\n"
         "names = {'slope', 'openness', 'roughness', 'sight'}\n"
         "settings = SimpleNamespace(names=names)\n"
         "def closed(v): return lambda awareness, contact_rate=None: v\n"

@@ -23,7 +23,7 @@ from trustbo.inference.functions.data import (
     observations_of,
 )
 from trustbo.inference.functions.draws import FunctionDraws
-from trustbo.inference.functions.function import Found, FunctionModel, Site, as_model
+from trustbo.inference.functions.function import Found, FunctionModel, as_model
 from trustbo.inference.functions.nuts import (
     Sampler,
     Samples,
@@ -34,6 +34,7 @@ from trustbo.inference.functions.nuts import (
     joined_samples,
     warm_start,
 )
+from trustbo.inference.functions.sites import Site
 from trustbo.inference.tree import N_PRIOR, kept_draws, to_datatree
 from trustbo.models.backend import VERSIONS, own_settings
 from trustbo.models.families import FAMILIES

@@ -1,18 +1,11 @@
-"""A NumPyro function as a trust model: its inputs, its sites, and what identifies it in files."""
+"""A NumPyro function as a trust model: its inputs, its densities, and what a draw computes."""
 
-import ast
-import functools
-import hashlib
 import inspect
-import io
 import json
-import pickle
 import re
-import textwrap
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cached_property
-from types import CodeType
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 from numpyro.distributions import (
-    Distribution,
     ExpandedDistribution,
     Independent,
     MaskedDistribution,
@@ -32,11 +24,20 @@ from numpyro.primitives import Messenger, sample
 
 from trustbo.display import joined
 from trustbo.errors import TrustboError
-from trustbo.inference.functions.data import NAMES, RATES, Data, arrays_of, observations_of
+from trustbo.inference.functions.data import NAMES, RATES, Data, arrays_of
+from trustbo.inference.functions.identity import constants_of, fingerprint, name_of
+from trustbo.inference.functions.sites import (
+    Site,
+    axes_that_differ,
+    computed_site,
+    doubled,
+    has_prior,
+    latent_in,
+    plates_of_rates,
+    site_of,
+)
 from trustbo.models.backend import own_settings
 from trustbo.models.contact_rate import ContactRate
-from trustbo.models.model import TrustModel
-from trustbo.models.record import model_to_record
 from trustbo.statespace import Inputs, StateSpace
 
 KIND = "function"
@@ -51,24 +52,6 @@ _AXES = ("chain", "draw")
 """Names that no variable may have."""
 _OF_SHAPES = re.compile("ncompatible shapes|could not be broadcast|not broadcast")
 """Errors of JAX and NumPy about shapes that do not fit each other."""
-_MODULE = "$params"
-"""Suffix of the site with the initial weights of a neural network in `numpyro.contrib.module`."""
-_FROM_REPARAM = ("_decentered", "_base")
-"""Suffixes of the latent variable to which a reparametrisation of NumPyro moves the plates."""
-_HASH_LENGTH = 16
-"""Number of hexadecimal digits of a hash."""
-
-
-class Site(NamedTuple):
-    """Latent variable of a function, or a site of `numpyro.deterministic`."""
-
-    dims: tuple[str, ...]
-    """Names of its axes: those of its plates, and `name_dim_0` and so on for others."""
-    mission_axis: int | None
-    """Axis that runs over missions; None if the variable is common to all missions."""
-    shape: tuple[int, ...]
-    n_free: int
-    """Number of its coordinates in unconstrained space; 0 if it is no latent variable."""
 
 
 class Found(NamedTuple):
@@ -104,7 +87,7 @@ class FunctionModel:
                 `contact_rate` is not among the parameters.
         """
         self.function = function
-        self.name = _name_of(function)
+        self.name = name_of(function)
         self.inputs = _inputs_of(function, self.name)
         self.fingerprint = fingerprint(function)
         self.compiled: dict[tuple[str, tuple[str, ...]], Callable[..., Any]] = {}
@@ -162,8 +145,8 @@ class FunctionModel:
             raise TrustboError(f"{self.in_short()} has no latent variable to learn; sample one.")
 
         self._require_features_in_range(data)
-        plates = _plates_of_rates(trace)
-        return {name: _site(trace[name], free[name], plates) for name in free}
+        plates = plates_of_rates(trace)
+        return {name: site_of(trace[name], free[name], plates) for name in free}
 
     def computed_sites(self, data: Data) -> dict[str, Site]:
         """Return the sites of `numpyro.deterministic` by name, without those that have bounds.
@@ -177,16 +160,16 @@ class FunctionModel:
             return {}
 
         try:
-            more_missions, more_bounds = (self._shapes(_doubled(data, n))[0] for n in (0, 1))
+            more_missions, more_bounds = (self._shapes(doubled(data, n))[0] for n in (0, 1))
         except TrustboError:  # the function is made for this number of missions and bounds
             more_missions = more_bounds = trace
-        plates = _plates_of_rates(trace)
+        plates = plates_of_rates(trace)
         sites = {}
         for name in names:
-            if _axes_that_differ(trace[name], more_bounds[name]):
+            if axes_that_differ(trace[name], more_bounds[name]):
                 continue
-            axes = _axes_that_differ(trace[name], more_missions[name])
-            sites[name] = _computed_site(trace, name, plates, axes[0] if axes else None)
+            axes = axes_that_differ(trace[name], more_missions[name])
+            sites[name] = computed_site(trace, name, plates, axes[0] if axes else None)
         return sites
 
     def _shapes(self, data: Data) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -205,7 +188,7 @@ class FunctionModel:
             self._require_sites_again(found, key, inputs)
             return {
                 name: biject_to(found[name]["fn"].support).inv(found[name]["value"])
-                for name in _latent(found)
+                for name in latent_in(found)
             }
 
         with own_settings(), _explained(self, data):
@@ -327,7 +310,7 @@ class FunctionModel:
                     f"the site {name!r} of {self.in_short()} has the name of an axis of "
                     "posteriors; give it another name."
                 )
-            if one["type"] == "param" and not _has_prior(name, trace):
+            if one["type"] == "param" and not has_prior(name, trace):
                 raise TrustboError(
                     f"the site {name!r} of {self.in_short()} is a parameter to optimise "
                     "(numpyro.param, flax_module), which NUTS leaves at its initial value; use "
@@ -384,7 +367,7 @@ class FunctionModel:
     def prior(self, key: jax.Array, data: Data) -> dict[str, Any]:
         """Draw the variables from the prior."""
         trace = self._trace({}, key, data)
-        return {name: trace[name]["value"] for name in _latent(trace)}
+        return {name: trace[name]["value"] for name in latent_in(trace)}
 
     def deterministic(
         self, values: Mapping[str, Any], key: jax.Array, data: Data
@@ -401,7 +384,7 @@ class FunctionModel:
             space=rates.space,
             inputs=rates.inputs,
             log_prior={
-                name: trace[name]["fn"].log_prob(trace[name]["value"]) for name in _latent(trace)
+                name: trace[name]["fn"].log_prob(trace[name]["value"]) for name in latent_in(trace)
             },
             log_likelihood=rates.log_prob(trace[RATES]["value"]),
             of_counts=jnp.asarray(rates.n_ticks is not None),
@@ -585,355 +568,3 @@ def _inputs_of(function: Callable[..., Any], name: str) -> tuple[str, ...]:
             f"inputs are {joined(list(NAMES))}. Give it a default, or use functools.partial."
         )
     return takes
-
-
-def _latent(trace: Mapping[str, Any]) -> list[str]:
-    """Return the names of the latent variables in a trace."""
-    return [
-        name for name, site in trace.items() if site["type"] == "sample" and not site["is_observed"]
-    ]
-
-
-def _has_prior(name: str, trace: Mapping[str, Any]) -> bool:
-    """Return whether a parameter holds the initial weights of a network whose weights are sampled.
-
-    This is the case for `numpyro.contrib.module.random_flax_module` and its like.
-    """
-    network = name.removesuffix(_MODULE)
-    return network != name and any(one.startswith(f"{network}/") for one in _latent(trace))
-
-
-def _site(site: Mapping[str, Any], free: Any, plates: set[str]) -> Site:
-    """Describe a latent variable; `plates` are those of the contact rates."""
-    shape = np.shape(site["value"])
-    n_batch = len(shape) - len(site["fn"].event_shape)
-    axes = _axes_of_plates(shape, n_batch, site["cond_indep_stack"])
-    dims, mission_axis = _dims(site["name"], shape, axes, plates)
-    return Site(dims, mission_axis, shape, int(np.prod(np.shape(free))))
-
-
-def _computed_site(
-    trace: Mapping[str, Any], name: str, plates: set[str], mission_axis: int | None
-) -> Site:
-    """Describe a site of `numpyro.deterministic`; `mission_axis` is that of all missions, if known.
-
-    NumPyro does not know how many of its axes belong to an event. The fewest for which the plates
-    have the right sizes are assumed.
-    """
-    shape = np.shape(trace[name]["value"])
-    stacks = [trace.get(f"{name}{suffix}", {}) for suffix in ("", *_FROM_REPARAM)]
-    stack = next((s["cond_indep_stack"] for s in stacks if s.get("cond_indep_stack")), [])
-
-    axes: dict[int, str] = {}
-    for n_event in range(len(shape)):
-        axes = _axes_of_plates(shape, len(shape) - n_event, stack)
-        if len(axes) == len(stack):
-            break
-    dims, _ = _dims(name, shape, axes, plates)
-    if mission_axis is not None:
-        dims = (*dims[:mission_axis], "mission", *dims[mission_axis + 1 :])
-    return Site(dims, mission_axis, shape, 0)
-
-
-def _axes_of_plates(shape: tuple[int, ...], n_batch: int, stack: Sequence[Any]) -> dict[int, str]:
-    """Return the names of plates by the axis of an array that has the size of the plate."""
-    axes = {n_batch + frame.dim: frame for frame in stack}  # `dim` counts from the last axis
-    return {
-        axis: frame.name
-        for axis, frame in axes.items()
-        if 0 <= axis < n_batch and shape[axis] == frame.size
-    }
-
-
-def _dims(
-    name: str, shape: tuple[int, ...], axes: Mapping[int, str], plates: set[str]
-) -> tuple[tuple[str, ...], int | None]:
-    """Return the names of the axes of a variable, and the axis that runs over missions."""
-    dims = [axes.get(axis, f"{name}_dim_{axis}") for axis in range(len(shape))]
-    mission_axis = None
-    for axis, plate in axes.items():
-        if plate in plates:
-            dims[axis] = "mission"
-            mission_axis = axis
-    return tuple(dims), mission_axis
-
-
-def _plates_of_rates(trace: Mapping[str, Any]) -> set[str]:
-    """Return the names of the plates of the contact rates, which are plates of missions."""
-    return {frame.name for frame in trace[RATES]["cond_indep_stack"]}
-
-
-def _doubled(data: Data, axis: int) -> dict[str, Any]:
-    """Return inputs with twice as many missions (axis 0) or bounds (axis 1)."""
-    arrays = {name: np.concatenate([v, v], axis) for name, v in arrays_of(data).items()}
-    more = {**data, **arrays}
-    if "observations" in data:
-        more["observations"] = observations_of(more)
-    return more
-
-
-def _axes_that_differ(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[int]:
-    """Return the axes in which the values of two sites differ in length."""
-    shapes = zip(np.shape(one["value"]), np.shape(other["value"]), strict=True)
-    return [axis for axis, (n, m) in enumerate(shapes) if n != m]
-
-
-def _name_of(function: Any) -> str:
-    """Return the name of a function, also of one in `functools.partial` or a handler."""
-    if isinstance(function, functools.partial) and not hasattr(function, "__name__"):
-        return _name_of(function.func)
-    if isinstance(function, Messenger) and function.fn is not None:
-        return _name_of(function.fn)
-    return getattr(function, "__name__", type(function).__name__)
-
-
-# --- what identifies a function ---
-
-
-def fingerprint(function: Callable[..., Any]) -> str:
-    """Return a hash of a function: its code, without comments, and the values that it refers to.
-
-    Values are defaults, variables of enclosing functions, and global variables. Modules, classes,
-    and functions of other modules are identified by their names alone.
-    """
-    parts: list[str] = []
-    _describe(function, parts, {})
-    text = "\n".join(parts)
-    return hashlib.sha256(text.encode()).hexdigest()[:_HASH_LENGTH]
-
-
-def constants_of(function: Callable[..., Any]) -> dict[str, str]:
-    """Return a short hash of each value that a function refers to, by name; see `fingerprint`.
-
-    These are arguments of `functools.partial`, defaults, variables of enclosing functions, and
-    global variables, also of functions of the same module that are called.
-    """
-    found: dict[str, str] = {}
-    _add_constants(function, found, set())
-    return found
-
-
-def _add_constants(function: Any, found: dict[str, str], seen: set[int]) -> None:
-    """Add the values that a function refers to; `seen` has the identities of earlier functions."""
-    if id(function) in seen:
-        return
-    seen.add(id(function))
-
-    values: dict[str, Any] = {}
-    inner: list[Any] = []
-    if isinstance(function, functools.partial):
-        given = {f"argument {n}": value for n, value in enumerate(function.args)}
-        values = {**given, **function.keywords}
-        inner = [function.func]
-    elif isinstance(function, Messenger):
-        inner = [function.fn]
-    elif inspect.ismethod(function):
-        values = {"self": function.__self__}
-        inner = [function.__func__]
-    elif inspect.isfunction(function):
-        values = _values_of(function)
-    elif _is_wrapper(function):
-        inner = [function.__wrapped__]
-
-    for name, value in values.items():
-        if inspect.isroutine(value) or _is_wrapper(value) or isinstance(value, functools.partial):
-            inner.append(value)
-            continue
-        parts: list[str] = []
-        _describe(value, parts, {})
-        found.setdefault(name, hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8])
-    for one in inner:
-        _add_constants(one, found, seen)
-
-
-def _values_of(function: Any) -> dict[str, Any]:
-    """Return the defaults, variables of enclosing functions and globals of a function by name."""
-    parameters = inspect.signature(function, follow_wrapped=False).parameters.values()
-    values = {one.name: one.default for one in parameters if one.default is not one.empty}
-    code = function.__code__
-    cells = function.__closure__ or ()
-    values |= {n: _content(cell) for n, cell in zip(code.co_freevars, cells, strict=True)}
-    names = sorted(_names_in(code) & set(function.__globals__))
-    values |= {name: function.__globals__[name] for name in names if _is_own(function, name)}
-    return values
-
-
-def _describe(value: Any, parts: list[str], seen: dict[int, int]) -> None:
-    """Add texts to `parts` that tell a value from others; `seen` numbers the functions so far."""
-    if isinstance(value, TrustModel):
-        parts.append(json.dumps(model_to_record(value), sort_keys=True))
-    elif inspect.ismethod(value):
-        _describe(value.__self__, parts, seen)
-        _describe(value.__func__, parts, seen)
-    elif inspect.isfunction(value):
-        _describe_function(value, parts, seen)
-    elif isinstance(value, functools.partial):
-        for one in (value.func, value.args, value.keywords):
-            _describe(one, parts, seen)
-    elif isinstance(value, np.ndarray | jax.Array):
-        is_key = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
-        array = np.asarray(jax.random.key_data(value) if is_key else value)
-        parts.append(f"{array.dtype} {array.shape} {hashlib.sha256(array.tobytes()).hexdigest()}")
-    elif isinstance(value, list | tuple | dict):
-        _describe_items(value, parts, seen)
-    elif _is_wrapper(value) or isinstance(value, Distribution | Messenger):
-        _describe_object(value, parts, seen)
-    else:
-        _describe_other(value, parts, seen)
-
-
-def _describe_items(value: Any, parts: list[str], seen: dict[int, int]) -> None:
-    """Describe the items of a list, a tuple or a dict."""
-    parts.append(f"{type(value).__name__} {len(value)}")
-    if isinstance(value, dict):
-        parts.extend(map(str, value))
-        value = value.values()
-    for one in value:
-        _describe(one, parts, seen)
-
-
-def _describe_function(
-    function: Callable[..., Any], parts: list[str], seen: dict[int, int]
-) -> None:
-    """Describe the code of a function and the values that it refers to."""
-    if id(function) in seen:  # a recursive function, or one that is used twice
-        parts.append(f"function {seen[id(function)]}")
-        return
-
-    seen[id(function)] = len(seen)
-    parts.append(_code_of(function))
-    defaults = function.__defaults__ or ()
-    by_keyword = function.__kwdefaults__ or {}
-    enclosed = [_content(cell) for cell in function.__closure__ or ()]
-    for one in (*defaults, *by_keyword.values(), *enclosed):
-        _describe(one, parts, seen)
-    for name in sorted(_names_in(function.__code__)):
-        _describe_global(function, name, parts, seen)
-
-
-def _names_in(code: CodeType) -> set[str]:
-    """Return the names of globals and attributes in a code, including its inner functions."""
-    inner = [_names_in(one) for one in code.co_consts if isinstance(one, CodeType)]
-    return {*code.co_names}.union(*inner)
-
-
-def _describe_global(
-    function: Callable[..., Any], name: str, parts: list[str], seen: dict[int, int]
-) -> None:
-    """Describe a global variable that a function refers to; see `fingerprint`."""
-    if name not in function.__globals__ or not _is_own(function, name):
-        return
-
-    value = function.__globals__[name]
-    if not _is_function(value):
-        parts.append(name)
-    _describe(value, parts, seen)
-
-
-def _is_own(function: Any, name: str) -> bool:
-    """Return whether a global is a value, or a function of the same module as `function`."""
-    value = function.__globals__[name]
-    if inspect.ismodule(value) or inspect.isclass(value):
-        return False
-    return not _is_function(value) or getattr(value, "__module__", None) == function.__module__
-
-
-def _is_function(value: Any) -> bool:
-    """Return whether a value is a function, or wraps one."""
-    return inspect.isroutine(value) or _is_wrapper(value)
-
-
-def _is_wrapper(value: Any) -> bool:
-    """Return whether a value wraps a function, such as `jax.jit`."""
-    return not isinstance(value, type) and callable(getattr(value, "__wrapped__", None))
-
-
-def _describe_object(value: Any, parts: list[str], seen: dict[int, int]) -> None:
-    """Describe an object by its class and attributes, and by the function that it wraps."""
-    parts.append(_kind_of(value))
-    if _is_wrapper(value):
-        _describe(value.__wrapped__, parts, seen)
-    attributes = vars(value) if hasattr(value, "__dict__") else {}
-    _describe({n: v for n, v in attributes.items() if not n.startswith("__")}, parts, seen)
-
-
-def _describe_other(value: Any, parts: list[str], seen: dict[int, int]) -> None:
-    """Describe a value that can be pickled; others are told apart by their kinds only.
-
-    Pickle refers to the class of an object by name, so the code of `__call__` is added.
-    """
-    content = io.BytesIO()
-    try:  # the text must be the same in other processes
-        _Pickler(content, protocol=4).dump(value)
-        parts.append(hashlib.sha256(content.getvalue()).hexdigest())
-    except Exception:
-        parts.append(_kind_of(value))
-
-    call = getattr(type(value), "__call__", None)  # noqa: B004
-    if inspect.isfunction(call):
-        _describe(call, parts, seen)
-
-
-class _Pickler(pickle.Pickler):
-    """Pickler that stores sets in the order of their items' texts.
-
-    The order of texts in a set differs between processes.
-    """
-
-    def persistent_id(self, value: Any) -> Any:
-        """Return what stands for a set; None for other values."""
-        return _sorted_texts(value) if isinstance(value, set | frozenset) else None
-
-
-def _sorted_texts(items: set[Any] | frozenset[Any]) -> list[str]:
-    """Return the texts of the items of a set, sorted; see `_describe`."""
-    texts = []
-    for one in items:
-        parts: list[str] = []
-        _describe(one, parts, {})
-        texts.append("\n".join(parts))
-    return sorted(texts)
-
-
-def _code_of(function: Callable[..., Any]) -> str:
-    """Return the code of a function without comments, or its byte code if there is no source.
-
-    Lambdas have no source of their own, because several can be in one line.
-    """
-    if function.__name__ == "<lambda>":
-        return _byte_code_of(function.__code__)
-    try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    except (OSError, TypeError, SyntaxError):
-        return _byte_code_of(function.__code__)
-    return ast.unparse(tree)
-
-
-def _byte_code_of(code: CodeType) -> str:
-    """Return a byte code as text, the same in other processes."""
-    constants = [_constant(one) for one in code.co_consts]
-    return f"{code.co_code.hex()} {constants} {code.co_names!r}"
-
-
-def _constant(value: Any) -> str:
-    """Return a constant of a byte code as text, the same in other processes."""
-    if isinstance(value, CodeType):
-        return _byte_code_of(value)
-    if isinstance(value, tuple):
-        return f"({', '.join(map(_constant, value))})"
-    if isinstance(value, frozenset):
-        return f"{{{', '.join(sorted(map(_constant, value)))}}}"
-    return repr(value)
-
-
-def _content(cell: Any) -> Any:
-    """Return the value of a variable of an enclosing function, or None if it is not set."""
-    try:
-        return cell.cell_contents
-    except ValueError:
-        return None
-
-
-def _kind_of(value: Any) -> str:
-    """Return the module and name of the class of a value."""
-    return f"{type(value).__module__}.{type(value).__qualname__}"

@@ -20,7 +20,8 @@ from numpyro.infer.hmc import hmc
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError
 from trustbo.inference.functions.data import Data, arrays_of
-from trustbo.inference.functions.function import FunctionModel, Site
+from trustbo.inference.functions.function import FunctionModel
+from trustbo.inference.functions.sites import Site
 from trustbo.models.backend import own_settings
 
 _CANDIDATES = 16

@@ -1,0 +1,116 @@
+"""Sites of a NumPyro function: their axes, which of them run over missions, and their sizes."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from trustbo.inference.functions.data import RATES, Data, arrays_of, observations_of
+
+_FROM_REPARAM = ("_decentered", "_base")
+"""Suffixes of the latent variable to which a reparametrisation of NumPyro moves the plates."""
+_MODULE = "$params"
+"""Suffix of the site with the initial weights of a neural network in `numpyro.contrib.module`."""
+
+
+class Site(NamedTuple):
+    """Latent variable of a function, or a site of `numpyro.deterministic`."""
+
+    dims: tuple[str, ...]
+    """Names of its axes: those of its plates, and `name_dim_0` and so on for others."""
+    mission_axis: int | None
+    """Axis that runs over missions; None if the variable is common to all missions."""
+    shape: tuple[int, ...]
+    n_free: int
+    """Number of its coordinates in unconstrained space; 0 if it is no latent variable."""
+
+
+def latent_in(trace: Mapping[str, Any]) -> list[str]:
+    """Return the names of the latent variables in a trace."""
+    return [
+        name for name, site in trace.items() if site["type"] == "sample" and not site["is_observed"]
+    ]
+
+
+def has_prior(name: str, trace: Mapping[str, Any]) -> bool:
+    """Return whether a parameter holds the initial weights of a network whose weights are sampled.
+
+    This is the case for `numpyro.contrib.module.random_flax_module` and its like.
+    """
+    network = name.removesuffix(_MODULE)
+    return network != name and any(one.startswith(f"{network}/") for one in latent_in(trace))
+
+
+def site_of(site: Mapping[str, Any], free: Any, plates: set[str]) -> Site:
+    """Describe a latent variable; `plates` are those of the contact rates."""
+    shape = np.shape(site["value"])
+    n_batch = len(shape) - len(site["fn"].event_shape)
+    axes = _axes_of_plates(shape, n_batch, site["cond_indep_stack"])
+    dims, mission_axis = _dims(site["name"], shape, axes, plates)
+    return Site(dims, mission_axis, shape, int(np.prod(np.shape(free))))
+
+
+def computed_site(
+    trace: Mapping[str, Any], name: str, plates: set[str], mission_axis: int | None
+) -> Site:
+    """Describe a site of `numpyro.deterministic`; `mission_axis` is that of all missions, if known.
+
+    NumPyro does not know how many of its axes belong to an event. The fewest for which the plates
+    have the right sizes are assumed.
+    """
+    shape = np.shape(trace[name]["value"])
+    stacks = [trace.get(f"{name}{suffix}", {}) for suffix in ("", *_FROM_REPARAM)]
+    stack = next((s["cond_indep_stack"] for s in stacks if s.get("cond_indep_stack")), [])
+
+    axes: dict[int, str] = {}
+    for n_event in range(len(shape)):
+        axes = _axes_of_plates(shape, len(shape) - n_event, stack)
+        if len(axes) == len(stack):
+            break
+    dims, _ = _dims(name, shape, axes, plates)
+    if mission_axis is not None:
+        dims = (*dims[:mission_axis], "mission", *dims[mission_axis + 1 :])
+    return Site(dims, mission_axis, shape, 0)
+
+
+def _axes_of_plates(shape: tuple[int, ...], n_batch: int, stack: Sequence[Any]) -> dict[int, str]:
+    """Return the names of plates by the axis of an array that has the size of the plate."""
+    axes = {n_batch + frame.dim: frame for frame in stack}  # `dim` counts from the last axis
+    return {
+        axis: frame.name
+        for axis, frame in axes.items()
+        if 0 <= axis < n_batch and shape[axis] == frame.size
+    }
+
+
+def _dims(
+    name: str, shape: tuple[int, ...], axes: Mapping[int, str], plates: set[str]
+) -> tuple[tuple[str, ...], int | None]:
+    """Return the names of the axes of a variable, and the axis that runs over missions."""
+    dims = [axes.get(axis, f"{name}_dim_{axis}") for axis in range(len(shape))]
+    mission_axis = None
+    for axis, plate in axes.items():
+        if plate in plates:
+            dims[axis] = "mission"
+            mission_axis = axis
+    return tuple(dims), mission_axis
+
+
+def plates_of_rates(trace: Mapping[str, Any]) -> set[str]:
+    """Return the names of the plates of the contact rates, which are plates of missions."""
+    return {frame.name for frame in trace[RATES]["cond_indep_stack"]}
+
+
+def doubled(data: Data, axis: int) -> dict[str, Any]:
+    """Return inputs with twice as many missions (axis 0) or bounds (axis 1)."""
+    arrays = {name: np.concatenate([v, v], axis) for name, v in arrays_of(data).items()}
+    more = {**data, **arrays}
+    if "observations" in data:
+        more["observations"] = observations_of(more)
+    return more
+
+
+def axes_that_differ(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[int]:
+    """Return the axes in which the values of two sites differ in length."""
+    shapes = zip(np.shape(one["value"]), np.shape(other["value"]), strict=True)
+    return [axis for axis, (n, m) in enumerate(shapes) if n != m]
