@@ -67,7 +67,7 @@ def test_a_bound_is_passed_if_neither_its_difficulty_nor_the_limit_stops_robots(
     tilt = np.tan(np.deg2rad([22.0, 18.0, 10.0])) / np.tan(np.deg2rad(22.0))
     x = np.column_stack([tilt, [0.5, 0.9, 0.1]])
     normals = {"intercept": (-3.0, 0.5), "coefficient": (1.0, 2.0), "margin": (1.0, 3.0)}
-    prior = Hazard(**normals, doubt=(0.0, 1.0))
+    prior = Hazard(**normals, log_width=(0.0, 0.5), doubt=(0.0, 1.0))
     of = prior.of_bounds(x, ("tilt", "narrowness"), LIMIT)
     alpha, beta = (part[0] for part in of.betas(np.array([[0.2, 0.5, -0.4, 1.2, 2.0]])))
     logit = -2.9 + 2.0 * (x[:, 1] - 0.5)

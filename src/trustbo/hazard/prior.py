@@ -44,8 +44,9 @@ class Hazard:
         doubt: Probability that the stated limit is wrong, and the sd of the margin in that case, in
             degrees. The prior on the margin is a mixture of two normals with the same mean. Use a
             probability of 0 if the limit was measured.
-        log_width: Prior on the log of the limit's width in degrees. The failure probability
-            increases from .1 to .9 if the tilt increases by 4.4 widths.
+        log_width: Prior on the log of the limit's width in degrees, .3 by default. The failure
+            probability increases from .1 to .9 if the tilt increases by 4.4 widths. Use a larger
+            width if the tilt of the driven curve is known less well.
         log_strength: Prior on the log of the strength s, the number of observations that the prior
             mean of a bound is worth. If each bound either always or never fails, s is small.
 
@@ -61,7 +62,7 @@ class Hazard:
     coefficient: tuple[float, float] = (2.0, 2.0)
     margin: tuple[float, float] = (0.0, 0.5)
     doubt: tuple[float, float] = (0.1, 4.0)
-    log_width: tuple[float, float] = (0.0, 0.5)
+    log_width: tuple[float, float] = (-1.2, 0.5)
     log_strength: tuple[float, float] = (-0.5, 1.0)
 
     def __post_init__(self) -> None:
