@@ -1,6 +1,7 @@
 """Check of a fitted model: planted faults stand out, and nothing does without one."""
 
 import numpy as np
+import numpyro.distributions as dist
 import pytest
 
 import trustbo as tb
@@ -48,6 +49,18 @@ def test_a_place_with_less_contact_stands_out():
     assert found.table.loc["places", "stands_out"]
     assert found.table.loc["places", "label"] == "(0, 5)"
     assert found.table.loc["places", "size"] < -0.1
+
+
+def test_a_shift_that_all_places_share_does_not_stand_out():
+    """It cannot be told from the intercept, which the prior holds back here."""
+    held = tb.models.Priors(
+        b=dist.Normal(0.0, 0.01), beta=dist.Normal(1.0, 0.02), beta0=dist.Beta(1.0, 50.0)
+    )
+    model = PooledTrust(held, effects=(PlaceEffect(),))
+    posterior = tb.fit(drawn(slope=0.6), model, progress=False)
+
+    assert (posterior["places"]["place"].mean(("chain", "draw")) > 0.1).all()
+    assert not tb.check(posterior).table.loc["places", "stands_out"]
 
 
 def test_place_effects_on_logits_are_reported_as_contact():

@@ -76,12 +76,14 @@ def check(
 ) -> Check:
     """Check a fitted model of contact rates for possible problems.
 
-    A robot stands out in a mission if its effect differs from the team's median by more than .1 of
-    line of sight, with a probability above .95. A place stands out if its effect exceeds .1 of
-    contact, and a weight if its sign contradicts its prior. The coverage of 90 % intervals one
-    mission ahead stands out if it differs from .9 by more than .05 and two standard errors over
-    missions. See also `pit` of `tb.inference.score` for the shape of predictions, `tb.compare` for
-    other models, and `az.psense_summary(posterior)` for the sensitivity to the priors.
+    A robot stands out in a mission if its effect differs from the team's median by more than .1
+    of line of sight, with a probability above .95. A place stands out if its effect differs
+    from the median over the visited places by more than .1 of contact: a shift that most places
+    share cannot be told from the intercept. A weight stands out if its sign contradicts its
+    prior. The coverage of 90 % intervals one mission ahead stands out if it differs from .9 by
+    more than .05 and two standard errors over missions. See also `pit` of `tb.inference.score`
+    for the shape of predictions, `tb.compare` for other models, and
+    `az.psense_summary(posterior)` for the sensitivity to the priors.
 
     Args:
         posterior: Posterior from `fit`, or all posteriors of a campaign (`Result.posteriors`). For
@@ -182,10 +184,12 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     of_cells = joined_draws(places["place"])[:, [cells.index(cell) for cell in where]]
     total = joined_draws(places["place_bound"]) + of_cells
     inverse_gain = theta_of(posterior, parameters_of(posterior))["inverse_gain"]
-    draws = total / inverse_gain.reshape(len(total), -1).mean(
-        1, keepdims=True
-    )  # of stationary trust
+    per_drift = inverse_gain.reshape(len(total), -1).mean(1, keepdims=True)
+    draws = total / per_drift  # of stationary trust
     draws = draws / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
+
+    # A shift that most places share cannot be told from the intercept: no place stands out by it.
+    draws = draws - np.median(draws, axis=1, keepdims=True)
 
     effect = draws.mean(0)
     sure = (draws * np.sign(effect) > 0.0).mean(0)
