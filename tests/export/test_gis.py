@@ -9,7 +9,9 @@ import pytest
 import rasterio
 import shapely
 from rasterio.warp import transform
+from worlds import unequal_robots
 
+import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.export import WRITERS, export_result, write_csv, write_geojson, write_geotiff
 from trustbo.export.gis import cut_at_180
@@ -92,3 +94,29 @@ def test_without_a_terrain_there_is_no_place_on_earth(result, maps, nowhere, tmp
         with pytest.raises(TrustboError):
             write(tmp_path / "a.tif", what)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_plan_is_written_in_the_formats_that_it_has(result, tmp_path):
+    assert export_result(result.plan, tmp_path) == [tmp_path / "path.geojson"]
+    written = export_result(result.plan, tmp_path / "both", ["geojson", "nav2"])
+    assert all(file.exists() for file in written)
+    for name in ("geotiff", "csv"):
+        with pytest.raises(TrustboError, match=name):
+            export_result(result.plan, tmp_path / "none", [name])
+    for write in (write_geotiff, write_csv):
+        with pytest.raises(TrustboError, match="campaign"):
+            write(tmp_path / "a.tif", result.plan)
+    assert not (tmp_path / "none").exists()
+
+
+def test_maps_before_the_first_mission_are_those_of_the_prior(tmp_path):
+    campaign = tb.Campaign(unequal_robots(), (2, 0), (0, 3))
+    write_geotiff(tmp_path / "maps.tif", campaign)
+    with rasterio.open(tmp_path / "maps.tif") as raster:
+        mean = raster.read(1 + raster.descriptions.index("trust_mean"))
+        sd = raster.read(1 + raster.descriptions.index("trust_sd"))
+    trust = campaign.trust_map.values  # at the prior mean
+    is_assumed = np.zeros(trust.shape, dtype=bool)
+    is_assumed[2, 0] = True  # the start
+    assert (np.abs(mean - trust) < sd)[~is_assumed].all()
+    assert (sd > 0.0)[~is_assumed].all()

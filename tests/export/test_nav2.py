@@ -142,3 +142,52 @@ def test_names_of_robots_that_are_no_names_of_files_are_refused(name, result, tm
     with pytest.raises(tb.TrustboError, match="name"):
         write_nav2(tmp_path, other)
     assert not list(tmp_path.iterdir())
+
+
+def poses(file):
+    """Positions of the waypoints in a file, (stop, 2)."""
+    listed = json.loads(file.read_text())["poses"]
+    return np.array([[one["pose"]["position"][axis] for axis in "xy"] for one in listed])
+
+
+def test_the_first_plan_of_a_campaign_is_written_as_waypoints(tmp_path):
+    campaign = tb.Campaign(unequal_robots(), (2, 0), (0, 3))
+    write_nav2(tmp_path, campaign.ask())
+    robots = ("lead", "r1", "r2", "r3")
+    names = {"frame.yaml", *(f"waypoints_{robot}.yaml" for robot in robots)}
+    assert {file.name for file in tmp_path.iterdir()} == names
+    frame = Frame(campaign.workspace.grid.center((2, 0)))
+    expected = frame.of_crs(campaign.ask().stops)
+    np.testing.assert_allclose(poses(tmp_path / "waypoints_lead.yaml"), expected, atol=1e-6)
+
+
+def test_the_next_path_replaces_the_recommended_one_beside_the_map_of_the_prior(tmp_path):
+    campaign = tb.Campaign(unequal_robots(blocked=[(0, 0)]), (2, 0), (0, 3))
+    write_nav2(tmp_path, campaign)  # nothing is learned yet
+    assert picture(tmp_path / "cost_map.pgm").min() < 98
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    lead = "waypoints_lead.yaml"
+    expected = Frame(campaign.workspace.grid.center((2, 0))).of_crs(campaign.plan.stops)
+    np.testing.assert_allclose(poses(tmp_path / lead), expected, atol=1e-6)
+
+    other = campaign.suggest([(2, 0), (2, 1), (2, 2), (2, 3), (1, 3), (0, 3)])
+    assert other.path != campaign.plan.path
+    write_nav2(tmp_path, other)
+    assert len(poses(tmp_path / lead)) == len(other.path)
+    for name in ("cost_map.yaml", "cost_map.pgm", "route_graph.geojson", "frame.yaml"):
+        assert (tmp_path / name).read_bytes() == before[name]
+
+
+def test_waypoints_in_another_frame_than_the_map_are_refused(result, tmp_path):
+    write_nav2(tmp_path, result, frame=Frame(result.workspace.grid.center((2, 0)), 0.3))
+    before = (tmp_path / "waypoints_lead.yaml").read_bytes()
+    with pytest.raises(TrustboError, match="frame"):
+        write_nav2(tmp_path, result.plan)
+    assert (tmp_path / "waypoints_lead.yaml").read_bytes() == before
+
+
+def test_a_plan_without_a_terrain_has_no_waypoints(result, nowhere, tmp_path):
+    bare = dataclasses.replace(result.plan, workspace=nowhere.workspace)
+    with pytest.raises(TrustboError, match="waypoints"):
+        write_nav2(tmp_path, bare)
+    assert not list(tmp_path.iterdir())

@@ -350,17 +350,17 @@ class Result(Summary):
     def maps(self, *, n_draws: int = 250) -> xr.Dataset:
         """Compute maps of the cells after the last mission; see `planning.Planner.maps`.
 
+        Before anything was learned, the maps are those of the prior (see `trust`).
+
         Args:
-            n_draws: Number of posterior draws.
+            n_draws: Number of draws.
 
         Returns:
             Dataset with the dims (y, x), whose coordinates are the centres of the cells in CRS
             metres; `isel(y=row, x=col)` selects a cell, and the accessor `.rio` writes rasters.
-
-        Raises:
-            TrustboError: Nothing could be learned yet.
         """
-        return self.planner.maps(self.posterior, n_draws=n_draws)
+        draws = self._beliefs if self.state.posterior is None else self.posterior
+        return self.planner.maps(draws, n_draws=n_draws)
 
     def plot_maps(self, **options: Any) -> np.ndarray:
         """Plot trust maps and paths of four missions; see `plots.trust_maps` for the options."""

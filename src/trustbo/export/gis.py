@@ -31,16 +31,18 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
 
     Args:
         path: .tif or .tiff file to write or replace.
-        maps: Result, or maps such as `Result.maps()`.
+        maps: Result or campaign, or maps such as `Result.maps()`. Before the first mission, the
+            maps are those of the prior.
 
     Raises:
-        TrustboError: The maps have no CRS, or the file cannot be written.
+        TrustboError: `maps` is a plan, which has no maps of all cells, or has no CRS, or the file
+            cannot be written.
 
     Example:
         >>> tb.export.write_geotiff("maps.tif", result.maps())
     """
     maps = maps.maps() if isinstance(maps, Result) else maps
-    require_kind("maps", maps, xr.Dataset, "give a result, or maps such as result.maps()")
+    require_kind("maps", maps, xr.Dataset, "give a result or a campaign, or its maps()")
     target = require_suffix(path, ".tif", ".tiff")
 
     if maps.rio.crs is None:
@@ -69,6 +71,9 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
 def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     """Write a path as GeoJSON (RFC 7946), in longitude and latitude (WGS 84).
 
+    For a result or a campaign, this is the recommended path, the best one under the posterior mean.
+    The next path of a campaign, which may differ, is written with `campaign.ask()`.
+
     The file contains a LineString of the path and a Point for each cell. The properties of a cell
     are the trust of each robot with its 90 % interval, and the failure probability. With a terrain,
     there is also a Point for each post and a LineString for each route. The property `layer` is
@@ -76,7 +81,8 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
 
     Args:
         path: File to write or replace.
-        plan: Plan, or result whose recommended path is written.
+        plan: Plan, such as `campaign.ask()` or that of `Campaign.replan` and `Follower.replan`; or
+            a result or campaign, whose recommended path is written.
 
     Raises:
         TrustboError: The workspace has no CRS, or the file cannot be written.
@@ -84,10 +90,11 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     Example:
         >>> tb.export.write_geojson("path.geojson", result.plan)
     """
+    name = "recommended path" if isinstance(plan, Result) else "planned path"
     plan = plan.plan if isinstance(plan, Result) else plan
     require_kind("plan", plan, Plan, "give a Plan, for example from Campaign.ask, or a Result")
     centres = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
-    facts = {"name": "most trustworthy path", "n_bounds": len(plan.path) - 1}
+    facts = {"name": name, "n_bounds": len(plan.path) - 1}
     facts |= {"value": float(plan.value), "objective": plan.objective}
     features = [_feature(plan, "path", centres, facts | {"length_m": float(plan.length)})]
     for about, place in zip(_cells(plan), centres, strict=True):
@@ -118,10 +125,11 @@ def write_csv(path: FilePath, result: Result) -> None:
 
     Args:
         path: File to write or replace.
-        result: Result of a campaign.
+        result: Result of a campaign, or the campaign.
 
     Raises:
-        TrustboError: There is no posterior yet, or the file cannot be written.
+        TrustboError: `result` is a plan, which has no missions, or there is no posterior yet, or
+            the file cannot be written.
 
     Example:
         >>> tb.export.write_csv("missions.csv", result)

@@ -46,6 +46,7 @@ _MIN_COST = 1e-9
 """Minimum cost of an edge, since the route server rejects 0."""
 _FARTHEST = 10_000.0
 """Largest distance of a frame's origin from the map, in metres; float32 then resolves 1 mm."""
+_NO_WAYPOINTS = "waypoints need a workspace made with Workspace.from_terrain."
 _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that Windows reserves, with any suffix."""
 
@@ -114,52 +115,100 @@ def _positions(xy: Any) -> np.ndarray:
 
 
 def write_nav2(
-    folder: FilePath, result: Result, *, frame: Frame | None = None, pixel: float | None = None
+    folder: FilePath,
+    result: Result | Plan,
+    *,
+    frame: Frame | None = None,
+    pixel: float | None = None,
 ) -> None:
     """Write the cost map, each robot's waypoints, the route graph and the frame to a folder.
+
+    For a result or a campaign, all files are written, with the waypoints of the *recommended* path.
+    Before the first mission, the costs are those of the prior. The next path of a campaign may
+    differ from the recommended path.
+
+    For a plan, such as `campaign.ask()`, only its waypoints and the frame are written, since a plan
+    has no costs of other bounds. A cost map and a route graph that are in the folder are kept.
 
     Args:
         folder: Folder for `cost_map.yaml` and `.pgm`, `waypoints_<robot>.yaml` (on a terrain),
             `route_graph.geojson` and `frame.yaml`.
-        result: Result of a campaign.
+        result: Result of a campaign, or the campaign; or a plan from `Campaign.ask`,
+            `Campaign.replan` or `Follower.replan`.
         frame: Frame of all files; by default, the centre of the first cell is the frame's origin.
         pixel: Side length of a map pixel, in metres; by default a tenth of a cell's shorter side.
 
     Raises:
         TrustboError: The frame is not a `Frame` or its origin is far off the map, a robot's name
             cannot be part of a file name, a robot has no route in a bound, the grid has too many
-            cells for Nav2's ids, the map has too many pixels, or a file cannot be written.
+            cells for Nav2's ids, the map has too many pixels, or a file cannot be written. Or a
+            plan has no terrain, or the folder has files in another frame than that of the plan.
 
     Example:
         >>> frame = tb.export.Frame(origin=(380_000.0, 5_224_800.0))
-        >>> tb.export.write_nav2("nav2", result, frame=frame)
+        >>> tb.export.write_nav2("nav2", campaign, frame=frame)
+        >>> tb.export.write_nav2("nav2", campaign.ask(), frame=frame)  # the next path's waypoints
     """
-    require_kind("result", result, Result, "give a result or a campaign")
+    require_kind(
+        "result", result, (Result, Plan), "give a result, a campaign, or a plan such as ask()"
+    )
     if frame is not None:
         require_kind("frame", frame, Frame, "give a trustbo.export.Frame")
     folder = to_path(folder)
+    plan = result.plan if isinstance(result, Result) else result
     workspace = result.workspace
-    place = Frame(workspace.grid.center(result.path[0])) if frame is None else frame
-    names = () if result.plan.stops is None else (LEAD, *workspace.team.names)
-    _require_file_names(names[1:])
+    place = Frame(workspace.grid.center(plan.path[0])) if frame is None else frame
 
     # Everything is made before the first file is written, so that no half of the files is left.
-    files = _ros_map(folder / "cost_map.yaml", result.maps()["cost"], workspace, place, pixel)
-    for robot in names:
-        poses = stops_of(result.plan, robot, place).tolist()
-        listed = [_pose(place.name, *pose) for pose in poses]
-        files[folder / f"waypoints_{robot}.yaml"] = json.dumps({"poses": listed}, indent=1).encode()
+    waypoints = _waypoints(plan, place, workspace)
+    files = {folder / f"waypoints_{robot}.yaml": text for robot, text in waypoints.items()}
+    about = _about(place, workspace)
 
-    files[folder / "route_graph.geojson"] = _graph(result, place).encode()
+    if isinstance(result, Result):
+        cost = result.maps()["cost"]
+        files |= _ros_map(folder / "cost_map.yaml", cost, workspace, place, pixel)
+        files[folder / "route_graph.geojson"] = _graph(result, place).encode()
+    else:
+        if not waypoints:
+            raise TrustboError(_NO_WAYPOINTS)
+        _require_near(place, workspace.grid.bounds)
+        _require_same_frame(folder / "frame.yaml", about)
+
+    files[folder / "frame.yaml"] = about
+    _write(files)
+
+
+def _waypoints(plan: Plan, frame: Frame, workspace: Workspace) -> dict[str, bytes]:
+    """Return the content of each robot's file of waypoints; empty without a terrain."""
+    names = () if plan.stops is None else (LEAD, *workspace.team.names)
+    _require_file_names(names[1:])
+
+    contents = {}
+    for robot in names:
+        poses = [_pose(frame.name, *pose) for pose in stops_of(plan, robot, frame).tolist()]
+        contents[robot] = json.dumps({"poses": poses}, indent=1).encode()
+    return contents
+
+
+def _about(frame: Frame, workspace: Workspace) -> bytes:
+    """Return the content of `frame.yaml`."""
     parent = "grid" if workspace.grid.crs is None else workspace.grid.crs_name
     about = {
-        "frame": place.name,
+        "frame": frame.name,
         "parent": parent,
-        "origin": [*place.origin],
-        "rotation": place.rotation,
+        "origin": [*frame.origin],
+        "rotation": frame.rotation,
     }
-    files[folder / "frame.yaml"] = json.dumps(about).encode()
-    _write(files)
+    return json.dumps(about).encode()
+
+
+def _require_same_frame(file: Path, content: bytes) -> None:
+    """Check that the files that stay in a folder are in the frame of the waypoints."""
+    if file.exists() and file.read_bytes() != content:
+        raise TrustboError(
+            f"the files in {str(file.parent)!r} are in another frame; pass their frame, which is "
+            f"in {file.name}, or use another folder."
+        )
 
 
 def _require_file_names(robots: Sequence[str]) -> None:
@@ -286,7 +335,7 @@ def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
     """
     require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
     if plan.stops is None or plan.posts is None or plan.routes is None:
-        raise TrustboError("waypoints need a workspace made with Workspace.from_terrain.")
+        raise TrustboError(_NO_WAYPOINTS)
 
     lead = frame.of_crs(plan.stops)
     if robot == LEAD:
@@ -329,7 +378,8 @@ def _graph(result: Result, frame: Frame) -> str:
         )
 
     posts = workspace.posts
-    graph = result.planner.graph(mean_of(result.posterior, result.workspace))
+    draws = result.belief if result.state.posterior is None else result.posterior
+    graph = result.planner.graph(mean_of(draws, result.workspace))
     place = workspace.grid.center if posts is None else posts.stop
     where = {cell: frame.of_crs(place(cell)).tolist() for cell in graph.nodes}
 
