@@ -43,6 +43,36 @@ def test_a_robot_that_degrades_stands_out_from_then_on():
     assert set(zip(odd["mission"], odd["robot"], strict=True)) == {(j, "r2") for j in range(5, 9)}
 
 
+def two_robots(seed, *, detection):
+    """Missions of two robots; the detector of r2 works in a share of all cases."""
+    rng, path = np.random.default_rng(seed), [(0, k) for k in range(9)]
+    missions = []
+    for _ in range(6):
+        z = rng.uniform(size=(8, 2, 1))
+        rate = (0.2 + 0.7 * z[..., 0]) * np.array([1.0, detection]) + 0.03 * rng.normal(size=(8, 2))
+        missions.append(
+            tb.Mission.from_arrays(path, z, np.clip(rate, 0.0, 1.0), features=["line_of_sight"])
+        )
+    return missions
+
+
+def test_of_two_robots_one_with_a_poor_detector_stands_out_beside_the_other():
+    found = checked(two_robots(0, detection=0.6))
+
+    assert found.robots["stands_out"].all()
+    both = found.robots.pivot(index="mission", columns="robot", values="effect")
+    np.testing.assert_allclose(both["r1"], -both["r2"])
+    assert (both["r2"] < -0.2).all()
+    row = found.table.loc["robots"]
+    assert (row["label"], row["stands_out"]) == ("r2", True)
+    assert row["size"] == both["r2"].min()
+    assert "r1" in row["finding"]
+
+
+def test_two_alike_robots_do_not_stand_out():
+    assert not checked(two_robots(1, detection=1.0)).robots["stands_out"].any()
+
+
 def test_a_place_with_less_contact_stands_out():
     found = checked(drawn(place=-0.35))
 
@@ -111,6 +141,12 @@ def test_coverage_is_not_tested_without_rates():
     assert "not tested" in found["finding"]
 
 
+def test_a_campaign_without_a_mission_has_nothing_to_check():
+    workspace = tb.Workspace.from_awareness(np.full((2, 2, 2, 2), 0.5))
+    with pytest.raises(tb.TrustboError, match="nothing has been learned"):
+        tb.check(tb.Campaign(workspace, (1, 0), (0, 1)))
+
+
 def test_what_is_no_posterior_of_contact_is_refused():
     for nothing in ({}, []):
         with pytest.raises(tb.TrustboError):
@@ -128,6 +164,7 @@ def test_posteriors_of_a_campaign_read_from_files_are_checked(tmp_path):
     given = tb.check(list(result.posteriors), missions=result.missions)
     found = tb.check(result.posteriors)
     assert found.table.equals(given.table)
+    assert tb.check(result).table.equals(given.table)
     assert "%" in found.table.loc["coverage", "finding"]
 
     one = tb.inference.score(result.posteriors)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import pandas as pd
@@ -27,6 +27,8 @@ SIZE = 0.1
 """Smallest effect on contact that may change a plan."""
 SURE = 0.95
 """Probability of such an effect that is required to report it."""
+_PAIR = 2
+"""Number of robots that are compared with each other instead of with their median."""
 _SIGNED = 0.6
 """Prior probability of a sign above which the sign is expected."""
 _COVERAGE = 0.9
@@ -47,7 +49,8 @@ class Check(Summary):
             it `stands_out`, the most affected `label`, and the `size` and `probability`.
         robots: One row per `mission` (counted from 1) and `robot`, with the `effect` (share of line
             of sight minus the median), its `sd`, the `probability` that it exceeds .1 in size, and
-            `stands_out`.
+            `stands_out`. With two robots, the effect is the difference to the other robot in the
+            same mission, so that both rows of a mission have opposite signs.
     """
 
     verdict: str
@@ -57,6 +60,16 @@ class Check(Summary):
     def _rows(self) -> Rows:
         rows = [(str(name), str(row["finding"])) for name, row in self.table.iterrows()]
         return [("verdict", self.verdict), *rows]
+
+
+@runtime_checkable
+class HasPosteriors(Protocol):
+    """Result or campaign, which are defined in a package above this one."""
+
+    @property
+    def posteriors(self) -> Posteriors:
+        """Posteriors after each mission; None where there was none yet."""
+        ...
 
 
 class Finding(NamedTuple):
@@ -71,23 +84,25 @@ class Finding(NamedTuple):
 
 @computing()
 def check(
-    posterior: xr.DataTree | Sequence[xr.DataTree | None],
+    posterior: xr.DataTree | Sequence[xr.DataTree | None] | HasPosteriors,
     missions: Sequence[Mission] | None = None,
 ) -> Check:
     """Check a fitted model of contact rates for possible problems.
 
     A robot stands out in a mission if its effect differs from the team's median by more than .1
-    of line of sight, with a probability above .95. A place stands out if its effect differs
-    from the median over the visited places by more than .1 of contact: a shift that most places
-    share cannot be told from the intercept. A weight stands out if its sign contradicts its
+    of line of sight, with a probability above .95. With two robots, whose median lies halfway
+    between them, the difference between both is tested instead. A place stands out if its effect
+    differs from the median over the visited places by more than .1 of contact: a shift that most
+    places share cannot be told from the intercept. A weight stands out if its sign contradicts its
     prior. The coverage of 90 % intervals one mission ahead stands out if it differs from .9 by
     more than .05 and two standard errors over missions. See also `pit` of `tb.inference.score`
     for the shape of predictions, `tb.compare` for other models, and
     `az.psense_summary(posterior)` for the sensitivity to the priors.
 
     Args:
-        posterior: Posterior from `fit`, or all posteriors of a campaign (`Result.posteriors`). For
-            a campaign, the last posterior is checked, and the predictions of the others are scored.
+        posterior: Posterior from `fit`; or a result or campaign, which stand for their
+            `posteriors`; or all posteriors of a campaign (`Result.posteriors`). For a campaign, the
+            last posterior is checked, and the predictions of the others are scored.
         missions: All missions of the campaign; by default, those of `Result.posteriors`, or the
             missions in the last posterior. Missions without an earlier posterior and excluded
             missions are not predicted.
@@ -98,8 +113,10 @@ def check(
 
     Example:
         >>> result = tb.iterate(workspace, (9, 0), (0, 9), n_iterations=2)
-        >>> tb.check(result.posteriors).verdict
+        >>> tb.check(result).verdict
     """
+    if isinstance(posterior, HasPosteriors):
+        posterior = posterior.posteriors
     trees = posterior if isinstance(posterior, Sequence) else [posterior]
     tree = last_posterior("check", trees)
     if is_of_people(tree):
@@ -128,8 +145,12 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     group = posterior["robots"].to_dataset()
     draws = joined_draws(group["robot_effect"])
 
-    # The weight of line of sight already includes what all robots and missions have in common.
-    draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
+    if draws.shape[2] == _PAIR:
+        # The median would lie halfway between both, and neither would stand out.
+        draws = draws - draws[:, :, ::-1]
+    else:
+        # The weight of line of sight already includes what all robots and missions have in common.
+        draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
     draws = draws / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
 
     # Missions of earlier campaigns, which have negative indices, only serve as a reference.
@@ -157,16 +178,26 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
     mission = robots["mission"].to_numpy()
     robot = robots["robot"].to_numpy()
 
+    # Of two robots, both stand out. One sentence is enough, about the robot with less contact.
+    names = list(dict.fromkeys(robot))
+    shown = odd & (effect < 0.0) if len(names) == _PAIR else odd
+
     words = []
-    for name in dict.fromkeys(robot[odd]):
-        rows = odd & (robot == name)
+    for name in dict.fromkeys(robot[shown]):
+        rows = shown & (robot == name)
         if rows.sum() == (robot == name).sum():
             when = "all missions"
         else:
             when = f"mission {joined(mission[rows].astype(str).tolist())}"
-        words.append(f"{name}: {effect[rows].mean():+.2f} contact at full line of sight in {when}")
+        size = effect[rows].mean()
+        if len(names) == _PAIR:
+            [other] = (each for each in names if each != name)
+            what = f"{name}: {-size:.2f} less contact at full line of sight than {other}"
+        else:
+            what = f"{name}: {size:+.2f} contact at full line of sight"
+        words.append(f"{what} in {when}")
 
-    most = int(np.argmax(np.where(odd, np.abs(effect), 0.0)))
+    most = int(np.argmax(np.where(shown, np.abs(effect), 0.0)))
     size = float(effect[most])
     p = float(robots["probability"].to_numpy()[most])
     return Finding(joined(words), True, str(robot[most]), size, p)

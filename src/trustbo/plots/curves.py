@@ -202,7 +202,7 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
         TrustboError: A column is missing.
 
     Example:
-        >>> tb.plots.robot_effects(tb.check(result.posteriors).robots)
+        >>> tb.plots.robot_effects(tb.check(result).robots)
     """
     for name in ("mission", "robot", "effect", "sd", "stands_out"):
         require_choice("column", name, [str(column) for column in table.columns])
