@@ -81,6 +81,29 @@ def test_a_place_with_less_contact_stands_out():
     assert found.table.loc["places", "size"] < -0.1
 
 
+def test_a_robot_that_is_poor_on_the_only_path_stands_out():
+    """Its losses differ between bounds, so they look like effects of the robot in each bound."""
+    rng = np.random.default_rng(0)
+    path = [(0, k) for k in range(7)]
+    mean = np.ones((6, 3))
+    mean[:, 1] = 0.82, 0.77, 0.84, 0.8, 0.93, 0.79
+    missions = [
+        tb.Mission.from_arrays(
+            path,
+            np.ones((6, 3, 1)),
+            np.clip(mean + 0.01 * rng.normal(size=(6, 3)), 0.0, 1.0),
+            features=["line_of_sight"],
+        )
+        for _ in range(9)
+    ]
+    posterior = tb.fit(missions, MODEL, progress=False)
+
+    effect = posterior["robots"]["robot_effect"].mean(("chain", "draw")).sel(robot="r2")
+    assert abs(float(effect.mean())) < 0.1  # not an effect of the robot alone
+    assert tb.check(posterior).table.loc["robots", "label"] == "r2"
+    assert tb.check(posterior).table.loc["robots", "stands_out"]
+
+
 def test_a_shift_that_all_places_share_does_not_stand_out():
     """It cannot be told from the intercept, which the prior holds back here."""
     held = tb.models.Priors(

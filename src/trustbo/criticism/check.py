@@ -143,7 +143,7 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     if "robots" not in posterior.children:
         return pd.DataFrame()
     group = posterior["robots"].to_dataset()
-    draws = joined_draws(group["robot_effect"])
+    draws = joined_draws(group["robot_effect"]) + _in_all_bounds(posterior, group["robot"].values)
 
     if draws.shape[2] == _PAIR:
         # The median would lie halfway between both, and neither would stand out.
@@ -164,6 +164,22 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     labels = group["mission"].values[own] + 1, group["robot"].values
     index = pd.MultiIndex.from_product(labels, names=("mission", "robot"))
     return pd.DataFrame({n: v.ravel() for n, v in columns.items()}, index).reset_index()
+
+
+def _in_all_bounds(posterior: xr.DataTree, robots: np.ndarray) -> np.ndarray:
+    """Return the mean effect of each robot in the visited bounds, (draw, 1, robot), or 0.
+
+    If all missions take one path, a robot that is poor everywhere cannot be told from bounds that
+    are all bad for it. Its mean effect in these bounds therefore counts as an effect of the robot.
+    """
+    if "places" not in posterior.children:
+        return np.zeros(1)
+
+    places = of_workspace(posterior["places"].to_dataset())
+    if "place_robot" not in places or not places.sizes["bound"]:
+        return np.zeros(1)
+    in_bounds = joined_draws(places["place_robot"].sel(robot=robots).mean("bound"))
+    return in_bounds[:, None]
 
 
 def _check_robots(robots: pd.DataFrame) -> Finding:
