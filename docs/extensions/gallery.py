@@ -11,7 +11,7 @@ import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -27,29 +27,90 @@ _NOTEBOOKS = (
 _START, _GOAL = (7, 0), (0, 3)
 
 
-def figures() -> Iterator[tuple[str, Callable[[], Any]]]:
-    """Run a small campaign on the terrain of the package, and yield a drawing of each figure."""
+class Figure(NamedTuple):
+    """A figure of the gallery."""
+
+    name: str
+    """Full name of the function or method that draws it."""
+    draw: Callable[[], Any]
+    caption: str
+    wide: bool = False
+    """Whether the figure has panels side by side, which need the width of the page."""
+
+
+def figures() -> Iterator[Figure]:
+    """Run a small campaign with a poor robot on the terrain of the package, and yield figures."""
+    import arviz as az
+
     import trustbo as tb
 
     terrain = tb.terrain.example()
     workspace = tb.Workspace.from_terrain(terrain, shape=(8, 6))
+    damage = tb.simulation.Degradation("r2", detection=0.6)
+    simulator = tb.simulation.KinematicSimulator(workspace, events=[damage])
     result = tb.iterate(
-        workspace, _START, _GOAL, n_iterations=4, planner={"failure_cost": 9.0}, progress=False
-    )
+        workspace, _START, _GOAL, n_iterations=6, planner={"failure_cost": 9.0},
+        simulator=simulator, progress=False,
+    )  # fmt: skip
     plots = tb.plots
     robots = tb.check(result.posteriors).robots
     maps = result.history, result.trust_map, result.path
-
-    yield "trustbo.plots.terrain_maps", lambda: plots.terrain_maps(workspace)
-    yield "trustbo.plots.trust_maps", lambda: plots.trust_maps(*maps, workspace, missions=(1, 2))
-    yield "trustbo.plots.plan_map", lambda: plots.plan_map(result.plan, bounds=[1, 2])
-    yield "trustbo.plots.trust_curves", lambda: plots.trust_curves(result.posterior)
-    yield "trustbo.Result.plot_history", lambda: result.plot_history()
-    yield "trustbo.plots.robot_effects", lambda: plots.robot_effects(robots)
     sd = result.maps()["trust_sd"]
-    yield "trustbo.plots.cell_map", lambda: plots.cell_map(sd, workspace, path=result.path)
-    yield "trustbo.plots.grid_map", lambda: plots.grid_map(workspace)
-    yield "trustbo.plots.explore", lambda: plots.explore(result.plan, result.maps(), result.history)
+    size = {"figsize": (6, 3.6)}
+
+    def forest() -> Any:
+        weights = ["beta0", "beta", "b"]
+        return az.plot_forest(result.posterior, var_names=weights, figure_kwargs=size)
+
+    def predictions() -> Any:
+        return az.plot_ppc_dist(result.posterior, num_samples=50, figure_kwargs=size)
+
+    yield Figure(
+        "trustbo.plots.terrain_maps", lambda: plots.terrain_maps(workspace),
+        "Height and awareness: traversability and visibility of the terrain.",
+    )  # fmt: skip
+    yield Figure(
+        "trustbo.plots.trust_maps",
+        lambda: plots.trust_maps(*maps, workspace, missions=(1, 2)),
+        "Trust maps before missions 1 and 2, and after the last one, with the planned paths.",
+        wide=True,
+    )
+    yield Figure(
+        "trustbo.plots.trust_curves", lambda: plots.trust_curves(result.posterior),
+        "Trust in each robot along the last mission; the lidar of r2 is damaged.", wide=True,
+    )  # fmt: skip
+    yield Figure(
+        "trustbo.Result.plot_history", lambda: result.plot_history(),
+        "Contact lost in each mission, measured and predicted by the plan.",
+    )  # fmt: skip
+    yield Figure(
+        "trustbo.plots.plan_map", lambda: plots.plan_map(result.plan, bounds=[1, 2]),
+        "Routes, overwatch points and sight lines of two bounds of the plan.", wide=True,
+    )  # fmt: skip
+    yield Figure(
+        "trustbo.plots.robot_effects", lambda: plots.robot_effects(robots),
+        "Effect of each robot in each mission: r2 loses contact in all missions.",
+    )  # fmt: skip
+    yield Figure(
+        "trustbo.plots.cell_map", lambda: plots.cell_map(sd, workspace, path=result.path),
+        "Any map of cells, here the standard deviation of trust.",
+    )  # fmt: skip
+    yield Figure(
+        "trustbo.plots.grid_map", lambda: plots.grid_map(workspace),
+        "The planning cells with their rows and columns.",
+    )  # fmt: skip
+    yield Figure(
+        "arviz.plot_forest", forest,
+        "Posterior of memory, weights and intercept: means and intervals.",
+    )  # fmt: skip
+    yield Figure(
+        "arviz.plot_ppc_dist", predictions,
+        "Posterior predictive check: measured contact rates (black) and predicted ones.",
+    )  # fmt: skip
+    yield Figure(
+        "trustbo.plots.explore",
+        lambda: plots.explore(result.plan, result.maps(), result.history), "",
+    )  # fmt: skip
 
 
 def write_gallery(app: Sphinx) -> None:
@@ -61,9 +122,9 @@ def write_gallery(app: Sphinx) -> None:
         draw_figures()
         stamp.write_text(source)
 
-    names = json.loads((FOLDER / "figures.json").read_text())
+    drawn = json.loads((FOLDER / "figures.json").read_text())
     notebooks = [_notebook(path) for path in sorted((HERE.parent / "notebooks").glob("*.ipynb"))]
-    text = ["````{container} gallery", *(_figure(name) for name in names), "````"]
+    text = ["````{container} gallery", *(_figure(*entry) for entry in drawn), "````"]
     text += ["", "## Notebooks", "", _NOTEBOOKS, ""]
     text += ["````{container} gallery", *notebooks, "````", ""]
     new = "\n".join(text)
@@ -76,23 +137,24 @@ def draw_figures() -> None:
     """Save a picture of each figure, and the page of the explorer."""
     import trustbo as tb
 
-    names = []
+    saved = []
     with mpl.rc_context({"backend": "agg"}):
-        for name, draw in figures():
+        for name, draw, caption, wide in figures():
             drawn = draw()
             if name == "trustbo.plots.explore":
                 drawn.save(FOLDER / EXPLORER)
                 continue
 
-            names.append(name)
-            figure = np.ravel(drawn)[0].figure
+            saved.append((name, caption, wide))
+            is_arviz = name.startswith("arviz.")
+            figure = drawn.viz["figure"].item() if is_arviz else np.ravel(drawn)[0].figure
             figure.savefig(FOLDER / f"{name}.png", dpi=_DPI)
             mpl.pyplot.close(figure)
 
-    missing = {f"trustbo.plots.{name}" for name in tb.plots.__all__} - {*names}
+    missing = {f"trustbo.plots.{name}" for name in tb.plots.__all__} - {row[0] for row in saved}
     if missing != {"trustbo.plots.explore"}:
         raise ValueError(f"docs/extensions/gallery.py does not draw {sorted(missing)}")
-    (FOLDER / "figures.json").write_text(json.dumps(names))
+    (FOLDER / "figures.json").write_text(json.dumps(saved))
 
 
 def _source() -> str:
@@ -103,13 +165,19 @@ def _source() -> str:
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
-def _figure(name: str) -> str:
+def _figure(name: str, caption: str, wide: bool) -> str:
     """Return the text of a figure, which links to the page of its function."""
-    role = "func" if name.startswith("trustbo.plots") else "meth"
-    page = name if role == "func" else name.rpartition(".")[0]
-    target = f"generated/{page}.html" + ("" if role == "func" else f"#{name}")
-    short = name.removeprefix("trustbo.")
-    return _entry(f"{name}.png", f"Figure of {short}", target, f"{{py:{role}}}`{short} <{name}>`")
+    if name.startswith("arviz."):
+        short = name.replace("arviz.", "az.")
+        link = f"{{doc}}`{short} <howto/use-arviz>`"
+        target = "howto/use-arviz.html"
+    else:
+        role = "func" if name.startswith("trustbo.plots") else "meth"
+        page = name if role == "func" else name.rpartition(".")[0]
+        target = f"generated/{page}.html" + ("" if role == "func" else f"#{name}")
+        short = name.removeprefix("trustbo.")
+        link = f"{{py:{role}}}`{short} <{name}>`"
+    return _entry(f"{name}.png", caption, target, f"{link}: {caption}", wide=wide)
 
 
 def _notebook(path: Path) -> str:
@@ -126,10 +194,13 @@ def _notebook(path: Path) -> str:
     )
 
 
-def _entry(picture: str, alt: str, target: str, caption: str) -> str:
-    """Return a figure in MyST, whose picture and caption are links."""
+def _entry(picture: str, alt: str, target: str, caption: str, *, wide: bool = False) -> str:
+    """Return a figure in MyST, whose picture is a link."""
     path = f"generated/gallery/{picture}"
-    return f"```{{figure}} {path}\n:alt: {alt}\n:target: {target}\n\n{caption}\n```"
+    options = f":alt: {alt}\n:target: {target}"
+    if wide:
+        options += "\n:figclass: wide"
+    return f"```{{figure}} {path}\n{options}\n\n{caption}\n```"
 
 
 def copy_explorer(app: Sphinx, error: Exception | None) -> None:
