@@ -29,7 +29,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
 ]
-exclude_patterns = ["_build", "extensions", "generated/gallery", "paper"]
+exclude_patterns = ["_build", "extensions", "generated/gallery", "generated/index", "paper"]
 templates_path = ["_templates"]
 
 # Pages are Markdown. Notebooks are stored with their outputs and not executed here.

@@ -1,7 +1,7 @@
-"""Contents of the pages of the API: one page for each module, class and function.
+"""Contents of the pages of the API: one page for each module, class and function, and an index.
 
 The templates in `_templates/autosummary` list what `contents` finds. An object that several modules
-offer has one page, under its shortest name.
+offer has one page, under its shortest name. The page `api.md` includes the index of all names.
 """
 
 import importlib
@@ -15,6 +15,7 @@ from sphinx.application import Sphinx
 from sphinx.pycode import ModuleAnalyzer
 
 HERE = Path(__file__).resolve().parents[1]
+INDEX = HERE / "generated" / "index" / "names.md"
 
 
 def listed_modules() -> list[str]:
@@ -79,6 +80,39 @@ def description_of(name: str, value: object) -> list[str]:
     return []
 
 
+def write_index(app: Sphinx) -> None:
+    """Write a table of all public names of all modules, in alphabetical order."""
+    rows = ["| name | module | |", "|---|---|---|"]
+    for name, module in sorted(all_names(), key=lambda found: (found[0].lower(), found)):
+        text = summary_of(module, name).replace("|", "\\|")
+        rows.append(f"| {{py:obj}}`{name} <{module}.{name}>` | `{module}` | {text} |")
+
+    INDEX.parent.mkdir(parents=True, exist_ok=True)
+    INDEX.write_text("\n".join(rows) + "\n")
+
+
+def all_names() -> list[tuple[str, str]]:
+    """Pairs of each public name and the module with its page, without modules."""
+    kinds = ("classes", "exceptions", "functions")
+    pairs = []
+    for module, found in contents().items():
+        pairs += [(name, module) for kind in kinds for name in found[kind]]
+        pairs += [(name, module) for name, _ in found["constants"]]
+    return pairs
+
+
+def summary_of(module: str, name: str) -> str:
+    """Return the first sentence of the description of a public name."""
+    value = getattr(importlib.import_module(module), name)
+    if kind_of(value) == "constants":
+        lines = description_of(name, value)
+    else:
+        lines = (inspect.getdoc(value) or "").splitlines()
+
+    paragraph = " ".join("\n".join(lines).strip().partition("\n\n")[0].split())
+    return re.split(r"(?<=\.) (?=[A-Z])", paragraph)[0]
+
+
 def remove_stale_pages(app: Sphinx) -> None:
     """Remove the pages of names that are not public any more, about which Sphinx would warn."""
     known = set(app.config.autosummary_filename_map.values())
@@ -91,6 +125,7 @@ def remove_stale_pages(app: Sphinx) -> None:
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Remove old pages after autosummary has written its own."""
+    """Write the index, and remove old pages after autosummary has written its own."""
+    app.connect("builder-inited", write_index)
     app.connect("builder-inited", remove_stale_pages, priority=900)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
