@@ -34,7 +34,7 @@ def name_of(page):
 
 
 # Pages that compile models, or draw all figures.
-_SLOW = ("howto/use-arviz", "howto/your-own-model", "inference")
+_SLOW = ("howto/run-a-study-in-parallel", "howto/use-arviz", "howto/your-own-model", "inference")
 SLOW = {f"docs/{page}.md" for page in _SLOW}
 EXAMPLES = [
     pytest.param(page, marks=pytest.mark.slow if name_of(page) in SLOW else (), id=name_of(page))
