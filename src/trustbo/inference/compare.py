@@ -34,8 +34,9 @@ def compare(
 
     LOO of few missions often cannot decide. The column `verdict` says `"undecided"`, with the
     reason, if the difference to the best is below 4 nats or below two of its standard errors, or
-    there are fewer than 10 missions. The weights and the order then mean little. `p`, the effective
-    number of parameters, should be much smaller than `n_missions`.
+    there are fewer than 10 missions. If a verdict is undecided, do not use the weights or the order
+    of the models. `p`, the effective number of parameters, should be much smaller than
+    `n_missions`.
 
     Args:
         posteriors: Two or more posteriors by name, fitted to the same missions: from `fit`, of
