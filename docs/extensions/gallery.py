@@ -72,7 +72,7 @@ def figures() -> Iterator[Figure]:
     yield Figure(
         "trustbo.plots.trust_maps",
         lambda: plots.trust_maps(*maps, workspace, missions=(1, 2)),
-        "Trust maps before missions 1 and 2, and after the last one, with the planned paths.",
+        "Trust maps before mission 1, and after missions 1 and 6, with the next path.",
         wide=True,
     )
     yield Figure(
