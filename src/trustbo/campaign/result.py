@@ -38,7 +38,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 
 if TYPE_CHECKING:
-    from trustbo.plots.explore import Explorer
+    from trustbo.plots.explorer import Explorer
 
 _N_PRIOR_DRAWS = 1000
 """Draws from the prior for `Result.trust` before anything was learned."""

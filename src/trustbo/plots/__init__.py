@@ -1,19 +1,8 @@
-"""Figures. All functions except `explore` accept `ax` and return the axes."""
+"""Figures. All functions except `explore` accept `ax` and return the axes.
 
-from trustbo.plots.curves import robot_effects, trust_curves
-from trustbo.plots.explore import explore
-from trustbo.plots.grid import grid_map
-from trustbo.plots.maps import cell_map, terrain_maps, trust_maps
-from trustbo.plots.plan import plan_map
+Modules are imported on first use, so that maps of a terrain do not import JAX.
+"""
 
-__all__ = [
-    "cell_map",
-    "explore",
-    "grid_map",
-    "plan_map",
-    "robot_effects",
-    "terrain_maps",
-    "trust_curves",
-    "trust_maps",
-]
-__dir__ = __all__.copy  # tab completion lists only public names
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
