@@ -1,19 +1,19 @@
 """Paired comparisons of methods by group and kind of world, and comparison with version 0.4.
 
-    python benchmarks/groups.py [FILE]   # by default, the stored table of version 0.5
+    python benchmarks/groups.py           # of the stored table of version 0.5
+    python benchmarks/groups.py rows.csv  # of another table
 
 The results are from benchmarks/worlds.py. A row (see `rows_of`) is the mean over seeds of one
 method on one world and course. `lost` is the contact lost while learning, in bounds per mission;
 bounds that fail or are not reached count as fully lost.
 """
 
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from common import Table
+from common import Table, arguments, parsed
 from scipy import stats
 
 from trustbo.study import worlds
@@ -246,4 +246,10 @@ def interval(row: object, places: int) -> str:
 
 
 if __name__ == "__main__":
-    report_groups(pd.read_csv(sys.argv[1] if len(sys.argv) > 1 else STORED))
+    parser = arguments(__doc__ or "")
+    parser.add_argument("file", nargs="?", type=Path, default=STORED, metavar="FILE",
+                        help="table of rows, by default that of version 0.5")  # fmt: skip
+    given = parsed(parser)
+    if not given.file.exists():
+        parser.error(f"there is no file {given.file}")
+    report_groups(pd.read_csv(given.file))

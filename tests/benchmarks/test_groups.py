@@ -1,5 +1,10 @@
 """Groups and kinds of worlds: means, differences and p-values of results made by hand."""
 
+import subprocess
+import sys
+from pathlib import Path
+
+import groups
 import numpy as np
 import pandas as pd
 import pytest
@@ -187,6 +192,15 @@ def test_the_report_has_every_group_and_kind(capsys):
     assert "| robots, weather, changes (" in text
     assert text.count("| limit, ") == 2
     assert all(f"| {kind} (" in text for kind in KINDS)
+
+
+def test_help_is_printed_without_reading_a_table():
+    script = Path(groups.__file__)
+    found = subprocess.run(
+        [sys.executable, script, "--help"], capture_output=True, text=True, check=True
+    )
+    assert found.stdout.startswith("usage: groups.py")
+    assert "FILE" in found.stdout
 
 
 def test_worlds_are_of_their_terrains():
