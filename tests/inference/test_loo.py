@@ -165,7 +165,14 @@ def test_compare_ranks_as_arviz_does_and_refuses_other_missions():
     }
     table, theirs = compare(fits), az.compare({name: loo(tree) for name, tree in fits.items()})
     assert list(table.index) == list(theirs.index)
-    np.testing.assert_allclose(table["elpd_diff"], theirs["elpd_diff"], atol=1e-9)
+    raw = az.compare({name: loo(tree) for name, tree in fits.items()}, round_to="none")
+    np.testing.assert_allclose(table["elpd_diff"], raw["elpd_diff"], atol=1e-9)
+    np.testing.assert_allclose(table["elpd"], raw["elpd"], atol=1e-9)
+    assert table["elpd_diff"].iloc[1] == pytest.approx(
+        table["elpd"].iloc[1] - table["elpd"].iloc[0]
+    )
+    rounded = compare(fits, round_to="auto")
+    assert rounded["elpd"].tolist() == theirs["elpd"].tolist()
     with pytest.raises(TrustboError, match="fewer"):
         compare({"level": fits["level"], "fewer": fit(missions[:5], PooledTrust())})
     with pytest.raises(TrustboError):

@@ -1,6 +1,7 @@
 """Ranking of posteriors by leave-one-mission-out cross-validation."""
 
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -28,6 +29,7 @@ def compare(
     posteriors: Mapping[str, xr.DataTree],
     *,
     models: Mapping[str, Model] | None = None,
+    round_to: int | Literal["auto", "none"] = "none",
     progress: bool = True,
 ) -> pd.DataFrame:
     """Rank posteriors by leave-one-mission-out cross-validation; see `loo` and `arviz.compare`.
@@ -46,6 +48,9 @@ def compare(
             `"contact_rate"` otherwise. It is refused if a mission would need a refit.
         models: Models by the same names; needed for models with custom priors and for NumPyro
             functions that were not used before in this process.
+        round_to: Number of decimal places, as in `arviz.compare`. `"auto"`, the default of ArviZ,
+            rounds `elpd` to the precision of its standard error, which hides differences between
+            models that are smaller; the default `"none"` does not round.
         progress: Whether to show a progress bar after 5 seconds.
 
     Returns:
@@ -76,7 +81,7 @@ def compare(
     _require_same_data(targets)
 
     found = {name: estimated(target, progress=progress) for name, target in targets.items()}
-    table = ranked(found)
+    table = ranked(found, round_to=round_to)
     after_p = table.columns.get_loc("p") + 1  # pyright: ignore[reportOperatorIssue]
     table.insert(after_p, "n_missions", [found[name].n_data_points for name in table.index])
     table.insert(after_p + 1, "verdict", _verdicts(found, list(table.index)))
