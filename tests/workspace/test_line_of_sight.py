@@ -298,6 +298,25 @@ def test_a_feature_of_cells_has_another_name(wooded):
         Workspace.from_terrain(wooded.terrain, (4, 4), features=features)
 
 
+def test_a_cell_without_room_is_impassable_and_the_others_are_as_before():
+    """The cell (2, 2) is a plateau except for a pixel, which alone is linked to the rest."""
+    terrain = synthetic_terrain((60.0, 60.0), resolution=2.0, seed=0, relief=1.0)
+    heights = np.zeros(terrain["dem"].shape)
+    heights[20:, 20:] = 20.0
+    heights[20:22, 20:22] = 0.0
+    terrain["dem"] = terrain["dem"].copy(data=heights)
+    terrain["dsm"] = terrain["dem"]
+
+    with pytest.warns(UserWarning, match=r"cell \(2, 2\) has 1 passable pixel,"):
+        workspace = Workspace.from_terrain(terrain, (3, 3), Team(n_robots=3))
+    passable = workspace.passable.values
+    assert not passable[2, 2]
+    assert passable.sum() == 8
+    assert np.isnan(workspace.awareness.values[:, :, 2, 2]).all()
+    with pytest.raises(TrustboError, match="too few"):
+        workspace.locate((2, 2))
+
+
 def test_no_room_to_stand_is_named():
     terrain = synthetic_terrain((12.0, 12.0), resolution=2.0, seed=0)
     with pytest.raises(

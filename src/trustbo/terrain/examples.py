@@ -22,6 +22,7 @@ def example() -> xr.Dataset:
     It is a steep hillside under bush in the Wairarapa, New Zealand, near Wellington: 195 m x 278 m
     at 1 m, 211 m of relief, trees up to 44.6 m tall. The attribute `attribution` states the source
     and the licence; `LICENCE.md` beside the files says which part of it is inferred.
+    Robots need a slope limit of about 38 degrees or more; for others, use `synthetic_terrain`.
 
     Returns:
         Dataset as from `read_terrain`.

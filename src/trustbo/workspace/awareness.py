@@ -136,11 +136,8 @@ def with_line_of_sight(
     """Append line of sight to the awareness of bounds (robot, move, row, col, feature).
 
     If traversability is one of the features of `pixels`, its values are replaced with means along
-    the robots' tracks. Raises TrustboError if a cell is too small for the team.
+    the robots' tracks.
     """
-    for row, col in np.argwhere(passable).tolist():
-        posts.require_room((row, col))
-
     is_known = TRAVERSABLE in pixels
     of_pixels = pixels[TRAVERSABLE].values if is_known else posts.surface.passable
     seen, traversability = bound_maps(posts, passable, of_pixels)

@@ -23,7 +23,7 @@ from scipy import ndimage
 from scipy.spatial.distance import cdist
 
 from trustbo.data import Cell
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, warn
 from trustbo.team import Robot, Team
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import MOVES
@@ -52,6 +52,7 @@ _WATCHING = 0.5  # weight of the sight of the lead's route in the score of a pos
 _CLOSING = 0.25  # weight of the sight from each of the lead's two stops
 _N_WATCHED = 30  # number of positions, best seen from the stops, that are rated for all aims
 _N_AIMS = 6  # number of times on the lead's route at which sight is computed
+_LISTED = 5  # number of cells without room that a warning names
 _SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # fractions of the straight line to a neighbouring stop
 
 
@@ -350,17 +351,43 @@ class Posts:
             near = near if len(near) else order
         return position[near]
 
-    def require_room(self, cell: Cell) -> None:
-        """Raise TrustboError if a cell has too few passable pixels for the robots."""
-        n_pixels = len(self._pixels_of(cell)[0])
-        names = self.team.names
+    def with_room(self, passable: np.ndarray) -> np.ndarray:
+        """Return which of the `passable` cells (row, col) have enough passable pixels for the team.
 
-        if n_pixels <= len(names):
-            raise TrustboError(
-                f"cell {cell} has {n_pixels} passable pixels, on which robot "
-                f"{names[max(0, n_pixels - 1)]!r} has no room beside the lead; use larger cells, "
-                "a finer raster or fewer robots."
-            )
+        A warning is issued if some cells have too few. Raises TrustboError if all have.
+        """
+        cells = [(row, col) for row, col in np.argwhere(passable).tolist()]
+        cramped = [cell for cell in cells if not self._has_room(cell)]
+        if not cramped:
+            return passable
+
+        n_pixels = len(self._pixels_of(cramped[0])[0])
+        pixels = "pixel" if n_pixels == 1 else "pixels"
+        robot = self.team.names[max(0, n_pixels - 1)]
+        problem = (
+            f"cell {cramped[0]} has {n_pixels} passable {pixels}, on which robot {robot!r} has no "
+            "room beside the lead"
+        )
+        remedy = "use larger cells, a finer raster or fewer robots"
+        if len(cramped) == len(cells):
+            raise TrustboError(f"{problem}, and no other cell has room; {remedy}.")
+
+        others = [str(cell) for cell in cramped[1:_LISTED]]
+        if len(cramped) > _LISTED:
+            others.append(f"{len(cramped) - _LISTED} more")
+        also = f" (also: {', '.join(others)})" if others else ""
+        warn(
+            f"{problem}{also}; pixels that are cut off from the rest do not count. Such a cell is "
+            f"treated as impassable. If you need it, {remedy}."
+        )
+
+        roomy = passable.copy()
+        roomy[tuple(np.transpose(cramped))] = False
+        return roomy
+
+    def _has_room(self, cell: Cell) -> bool:
+        """Return whether a cell has a passable pixel for the lead and for each robot."""
+        return len(self._pixels_of(cell)[0]) > len(self.team.names)
 
     def _pixels_of(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and columns of a cell's passable pixels, in the largest region if possible.

@@ -88,8 +88,10 @@ class Workspace(Summary):
 
         The mean of a feature over a cell applies to all robots and to all bounds into the cell.
         A cell is impassable if more than half of its pixels are missing or steeper than the slope
-        limit. Openness is measured up to the lidar's range, but no farther than the diagonal of a
-        cell, because T2 does not watch the lead beyond one bound.
+        limit. With `bounds`, a cell is also impassable if its passable pixels that are connected to
+        the rest are too few for the team, which a warning says. Openness is measured up to the
+        lidar's range, but no farther than the diagonal of a cell, because T2 does not watch the
+        lead beyond one bound.
 
         Because overwatch involves two cells, traversability is averaged along the robots' tracks in
         a bound. In addition, the feature `line_of_sight` is the predicted fraction of time in which
@@ -107,8 +109,9 @@ class Workspace(Summary):
             sight: Assumed model of sight; by default `Sight()`.
 
         Raises:
-            TrustboError: The dataset is not a terrain, the grid is too fine for the raster, a cell
-                is too small for the team, no cell is passable, or a feature has a reserved name.
+            TrustboError: The dataset is not a terrain, the grid is too fine for the raster, all
+                cells are too small for the team, no cell is passable, or a feature has a reserved
+                name.
 
         Example:
             >>> tb.Workspace.from_terrain(terrain, shape=(10, 10), team=tb.Team(n_robots=3))
@@ -133,6 +136,9 @@ class Workspace(Summary):
             cells, passable = cell_maps(pixels, drivable, grid)
             traversability = pixels[TRAVERSABLE].values if TRAVERSABLE in pixels else None
             posts = Posts(grid, team, sight, surface, traversability)
+
+            if bounds:
+                passable = posts.with_room(passable)
 
             # Bounds.
             z = np.repeat(of_moves(cells, passable)[None], team.n_robots, axis=0)
@@ -334,6 +340,11 @@ class Workspace(Summary):
         missing = self.grid.cell_means(self.terrain["dem"].isnull().astype(float))[cell]
         if missing > MAX_MISSING:
             return f": {missing:.0%} of it has no data"
+
+        if self.pixels is not None:
+            drivable = self.grid.cell_means(self.pixels["passable"].astype(float))[cell]
+            if drivable >= 1.0 - MAX_MISSING:
+                return ": its passable pixels are too few for the team or cut off from the others"
 
         steep = np.rad2deg(self.team.max_slope)
         return f": over half of it is missing or steeper than {steep:.0f} degrees, the team's limit"
