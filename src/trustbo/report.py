@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
@@ -12,6 +13,7 @@ from arviz_stats.summary import summary
 
 from trustbo import plots
 from trustbo.campaign.result import Result
+from trustbo.campaign.state import GIVEN_UP, incomplete_bounds
 from trustbo.data import Cell
 from trustbo.display import render
 from trustbo.errors import require_kind
@@ -110,11 +112,30 @@ def facts_of(result: Result) -> dict[str, str]:
     return facts | {
         "Expected contact": f"{contact.mean():.1%} of the time, averaged over robots and bounds",
         "Weakest bound": f"bound {worst + 1} into cell {_name(plan.path[worst + 1])}, "
-        f"expected contact {contact[worst]:.1%}",
+        f"expected contact {contact[worst]:.1%}, {_measured(result, plan.path[worst : worst + 2])}",
         "Uncertain": _uncertain(result),
         "Last mission": f"status {result.missions[-1].status}, contact {last}",
         "Reason for stopping": _ENDS.get(result.stop_reason, result.stop_reason),
     }
+
+
+def _measured(result: Result, bound: tuple[Cell, ...]) -> str:
+    """Return the measured contact of a bound, averaged over robots and missions, as text."""
+    rates = [
+        driven.contact_rate
+        for mission in result.missions
+        for cells, driven in zip(pairwise(mission.path), mission.bounds, strict=False)
+        if cells == bound
+    ]
+    known = [rate for rate in rates if np.isfinite(rate).any()]
+    if not rates:
+        return "not driven yet"
+    if not known:
+        return "driven but not measured"
+
+    often = "once" if len(known) == 1 else f"{len(known)} times"
+    mean = np.mean([np.nanmean(rate) for rate in known])
+    return f"measured contact {mean:.1%} (driven {often})"
 
 
 def _uncertain(result: Result) -> str:
@@ -222,9 +243,32 @@ def _maps(result: Result) -> _Section:
     )
 
 
+def failed_bounds_of(result: Result) -> list[str]:
+    """Return the bounds that were not completed in each row of `Result.table`, as text."""
+    missions = iter(result.missions)
+    words = []
+    for row in result.table().to_dict("records"):
+        if row["state"] == GIVEN_UP:  # only the cell is known
+            words.append(f"into {row['where']} ({row['status']})" if row["where"] else "")
+            continue
+        failed = incomplete_bounds(next(missions))
+        words.append(", ".join(f"{k} into {_name(cell)} ({why})" for k, cell, why in failed))
+    return words
+
+
 def _missions(result: Result) -> _Section:
     table = result.table()
-    columns = ("status", "contact_rate", "contact_lost", "objective", "n_bounds")
+    failed = failed_bounds_of(result)
+    if any(failed):
+        table["failed_bounds"] = failed
+    columns = (
+        "status",
+        "failed_bounds",
+        "contact_rate",
+        "contact_lost",
+        "objective",
+        "n_bounds",
+    )
     shown = table.loc[:, [name for name in columns if name in table]].rename_axis("mission")
     about = f"The objective is {result.settings['objective'].replace('_', ' ')}."
     if result.settings["objective"] == "lost_contact":

@@ -265,7 +265,7 @@ def test_table_has_a_row_for_each_mission_given_up(workspace):
     assert table.index.isna().tolist() == [True, False, False, True]
     where = [f"{row},{col}" for row, col in (path[2], part.path[2])]
     assert table["where"].tolist() == [where[0], "", where[1], ""]
-    assert table["reason"].tolist() == ["stuck", "", "", "rain"]
+    assert table["reason"].tolist() == ["stuck", "", "stuck", "rain"]
     assert table["state"].tolist() == ["given up", "learned", "learned", "given up"]
     assert table["status"].tolist() == ["stuck", "ok", part.status, "aborted"]
     assert table["n_bounds"].tolist()[:3] == [2, len(campaign.missions[0].bounds), 2]

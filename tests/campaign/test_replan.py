@@ -14,6 +14,7 @@ from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.models import PooledTrust
 from trustbo.planning import NoPathError, Planner
+from trustbo.report import failed_bounds_of
 from trustbo.workspace.moves import bounds_along, bounds_and_next
 
 ENDS = ((3, 0), (0, 3))
@@ -39,6 +40,28 @@ def begun(model=None, **options):
     campaign.tell(mission(PATH, rates_of(3, 1)))
     campaign.suggest(PATH)
     return campaign
+
+
+def test_the_table_and_the_report_name_the_bound_that_failed_before_replanning():
+    campaign = begun()
+    so_far = mission(PATH, rates_of(2), ["ok", "stuck"])
+    rest = campaign.replan(PATH[1], so_far).path[3:]
+    whole = (*PATH[:3], *rest)
+    n_bounds = len(whole) - 1
+    statuses = ["ok", "stuck", *["ok"] * (n_bounds - 2)]
+    campaign.tell(mission(whole, rates_of(n_bounds), statuses))
+
+    row = campaign.table().loc[2]
+    assert (row["status"], row["reason"], row["where"]) == ("ok", "stuck", "1,2")
+    assert campaign.history["reason"].values.tolist() == ["", "stuck"]
+    assert failed_bounds_of(campaign) == ["", "2 into 1,2 (stuck)"]
+
+    again = campaign.ask().path
+    campaign.fail("tipped", where=again[1])
+    campaign.exclude(2, "a bad day")
+    assert campaign.table()["reason"].tolist() == ["", "a bad day", "tipped"]
+    cell = ",".join(map(str, again[1]))
+    assert failed_bounds_of(campaign)[1:] == ["2 into 1,2 (stuck)", f"into {cell} (tipped)"]
 
 
 @pytest.mark.parametrize("objective", ["lost_contact", "terminal", "mean"])

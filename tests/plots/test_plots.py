@@ -198,6 +198,32 @@ def test_the_report_lists_the_cells_of_the_path_that_were_never_entered(result):
     assert f"never entered: {', '.join(new)};" in facts_of(other)["Uncertain"]
 
 
+def test_the_report_shows_failed_bounds_and_the_measured_contact_of_the_weakest(tmp_path):
+    awareness = np.random.default_rng(0).uniform(size=(2, 3, 3, 2))
+    workspace = tb.Workspace.from_awareness(awareness)
+    campaign = tb.Campaign(workspace, (2, 0), (0, 2), fit={"draws": 100}, progress=False)
+    unknown = np.full((2, 2, 2), np.nan)
+    rates = np.array([[0.9, 0.7], [0.25, 0.35]])
+    path = [(2, 0), (1, 1), (0, 2)]
+    campaign.tell(tb.Mission.from_arrays(path, unknown, rates, status=["ok", "stuck"]))
+    write_report(tmp_path / "report.html", campaign)
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<th>failed bounds</th>" in html
+    assert "<td>2 into 0,2 (stuck)</td>" in html
+
+    other = copy(campaign)
+    other._computed = dict(campaign._computed)
+    other._computed["plan"] = campaign.planner.evaluate(path, campaign.forecast)
+    weakest = facts_of(other)["Weakest bound"]
+    measured = {"bound 1": "80.0%", "bound 2": "30.0%"}[weakest[:7]]
+    assert f"measured contact {measured} (driven once)" in weakest
+
+    other._computed["plan"] = campaign.planner.evaluate(
+        [(2, 0), (2, 1), (1, 2), (0, 2)], campaign.forecast
+    )
+    assert "not driven yet" in facts_of(other)["Weakest bound"]
+
+
 @pytest.mark.parametrize(("bounds", "n"), [([], 1), ([2], 2)])
 def test_the_map_of_the_path_alone_shows_all_posts(result, bounds, n):
     axes = plots.plan_map(result.plan, bounds=bounds)

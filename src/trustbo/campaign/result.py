@@ -321,7 +321,7 @@ class Result(Summary):
         paths = [entry.plan.path for entry in entries]
         steps = np.stack([*zip_longest(*paths, fillvalue=NOWHERE)], axis=1)
         numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
-        table = pd.DataFrame([entry.row for entry in entries], numbers)
+        table = pd.DataFrame([entry.shown_row for entry in entries], numbers)
 
         history = table.drop(columns=["where", "n_bounds", "path"]).to_xarray()
         history["path"] = ("iteration", "step", "axis"), steps
@@ -333,13 +333,15 @@ class Result(Summary):
         """Return a table with one row per mission, labelled by its number, from 1.
 
         The columns are `status`, `state` ("told", not used yet; "learned"; "excluded"; "given up",
-        see `Campaign.fail`, without a number), the `reason` for the state or the failure, the cells
-        `where` a bound failed, the mean `contact_rate`, the `objective` of the plan, the number
-        `n_bounds` of bounds run, `path_changed` (whether the plan differs from the previous one),
-        the planned `path` as text, "9,0 8,1", `contact_lost` in bounds (bounds that were not run
-        lose all contact), and the diagnostics of the posterior (see `fit`).
+        see `Campaign.fail`, without a number), the `reason` for the state or the failure (else the
+        statuses of bounds that were not completed), the cells `where` a bound failed, the mean
+        `contact_rate`, the `objective` of the plan, the number `n_bounds` of bounds run,
+        `path_changed` (whether the plan differs from the previous one), the planned `path` as text,
+        "9,0 8,1", `contact_lost` in bounds (bounds that were not run lose all contact), and the
+        diagnostics of the posterior (see `fit`).
         """
-        rows = [entry.row | {"mission": n} for n, entry in enumerate(self.state.entries, start=1)]
+        entries = enumerate(self.state.entries, start=1)
+        rows = [entry.shown_row | {"mission": n} for n, entry in entries]
         for i, failure in enumerate(self.state.failures):  # after the mission that precedes it
             rows.insert(failure.after + i, failure.row())
 

@@ -88,6 +88,15 @@ class Posterior:
         return read_tree(*self.file)
 
 
+def incomplete_bounds(mission: Mission) -> list[tuple[int, Cell, str]]:
+    """Return the number (from 1), the cell and the status of each bound that was not completed."""
+    statuses = [*(bound.status for bound in mission.bounds[:-1]), mission.status]
+    bounds = zip(mission.bounds, statuses, strict=True)
+    return [
+        (k, bound.cell, status) for k, (bound, status) in enumerate(bounds, 1) if status != "ok"
+    ]
+
+
 @dataclass(eq=False)
 class Entry:
     """Recorded mission, with its plan and the posterior after it.
@@ -108,6 +117,13 @@ class Entry:
     trust_map: xr.DataArray
     row: dict[str, Any]
     posterior: Posterior | None = None
+
+    @property
+    def shown_row(self) -> dict[str, Any]:
+        """The row with the statuses of bounds that were not completed as the reason, if blank."""
+        statuses = [status for _, _, status in incomplete_bounds(self.mission)]
+        reason = self.row["reason"] or ", ".join(dict.fromkeys(statuses))
+        return self.row | {"reason": reason}
 
     def become(self, state: str, reason: str = "") -> None:
         """Change the state of the mission, in a new row, so that the change can be undone."""
@@ -202,9 +218,7 @@ class State:
         if mission.path[-1] != plan.path[-1]:  # the goal was not in the path any more
             n_planned = max(n_planned, len(plan.path) - 1)
         rates = mission.contact_rate
-        failed = [bound.cell for bound in mission.bounds[:-1] if bound.status != "ok"]
-        if mission.status != "ok":
-            failed.append(mission.bounds[-1].cell)
+        failed = [cell for _, cell, _ in incomplete_bounds(mission)]
         contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
 
         return {
