@@ -81,7 +81,7 @@ def compare(
     _require_same_data(targets)
 
     found = {name: estimated(target, progress=progress) for name, target in targets.items()}
-    table = ranked(found, round_to=round_to)
+    table = ranked(found, round_to=round_to)  # pyright: ignore[reportArgumentType]
     after_p = table.columns.get_loc("p") + 1  # pyright: ignore[reportOperatorIssue]
     table.insert(after_p, "n_missions", [found[name].n_data_points for name in table.index])
     table.insert(after_p + 1, "verdict", _verdicts(found, list(table.index)))
