@@ -155,6 +155,9 @@ ALWAYS = {
     "plan of draws": lambda campaign, folder: campaign.planner.plan_draws(campaign.belief),
     "Follower": followed,
     "hazard": lambda campaign, folder: campaign.risk.mean,
+    "maps": lambda campaign, folder: campaign.maps(n_draws=20),
+    "write_geotiff": lambda campaign, folder: tb.export.write_geotiff(folder / "m.tif", campaign),
+    "write_nav2": lambda campaign, folder: tb.export.write_nav2(folder / "nav2", campaign),
     "write_geojson": lambda campaign, folder: tb.export.write_geojson(folder / "p.json", campaign),
     "save and load": loaded,
     "resume": resumed,
@@ -169,6 +172,7 @@ OF_MISSIONS = {
     "write_missions": written_missions,
     "replay": replayed,
     "load_result": shown,
+    "explore": explored,
 }
 """Functions that need a mission, learned from or not."""
 
@@ -182,13 +186,9 @@ OF_RATES = {
 OF_POSTERIOR = {
     "posterior": lambda campaign, folder: campaign.posterior,
     "check": checked,
-    "maps": lambda campaign, folder: campaign.maps(n_draws=20),
-    "explore": explored,
     "trust_curves": lambda campaign, folder: tb.plots.trust_curves(campaign.posterior),
     "write_report": lambda campaign, folder: tb.report.write_report(folder / "r.html", campaign),
     "write_csv": lambda campaign, folder: tb.export.write_csv(folder / "m.csv", campaign),
-    "write_geotiff": lambda campaign, folder: tb.export.write_geotiff(folder / "m.tif", campaign),
-    "write_nav2": lambda campaign, folder: tb.export.write_nav2(folder / "nav2", campaign),
     "export_result": lambda campaign, folder: tb.export.export_result(
         campaign, folder / "all", list(tb.export.WRITERS)
     ),
