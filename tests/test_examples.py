@@ -83,6 +83,10 @@ class Prepared:
         return tb.iterate(self.workspace, START, GOAL, n_iterations=2, progress=False)
 
     @functools.cached_property
+    def campaign(self):
+        return tb.Campaign(self.workspace, START, GOAL)
+
+    @functools.cached_property
     def missions(self):
         return self.result.missions
 

@@ -190,7 +190,7 @@ def worlds(data: FilePath | None = None) -> dict[str, World]:
     Example:
         >>> worlds = tb.study.worlds()
         >>> len(worlds)
-        81
+        97
     """
     folder = None if data is None else str(data)
     return {world.name: replace(world, data=folder) for world in _all()}
