@@ -385,6 +385,11 @@ class Mission(Summary):
         """Measured awareness, shape (bound, robot, feature)."""
         return self._stacked("awareness")
 
+    @property
+    def statuses(self) -> list[str]:
+        """Status of each bound; that of the last bound is the status of the mission."""
+        return [*(bound.status for bound in self.bounds[:-1]), self.status]
+
     @cached_property
     def contact_rate(self) -> np.ndarray:
         """Contact rates, shape (bound, robot)."""

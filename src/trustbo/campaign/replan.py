@@ -121,8 +121,7 @@ def _returned(path: tuple[Cell, ...], cell: Cell, so_far: Mission) -> tuple[Cell
 
 def failed_bounds(mission: Mission) -> list[Pair]:
     """Return the cells left and entered of each bound that failed."""
-    statuses = [*(bound.status for bound in mission.bounds[:-1]), mission.status]
-    bounds = zip(pairwise(mission.path), statuses, strict=False)
+    bounds = zip(pairwise(mission.path), mission.statuses, strict=False)
     return [bound for bound, status in bounds if status in CAUSES]
 
 

@@ -90,8 +90,7 @@ class Posterior:
 
 def incomplete_bounds(mission: Mission) -> list[tuple[int, Cell, str]]:
     """Return the number (from 1), the cell and the status of each bound that was not completed."""
-    statuses = [*(bound.status for bound in mission.bounds[:-1]), mission.status]
-    bounds = zip(mission.bounds, statuses, strict=True)
+    bounds = zip(mission.bounds, mission.statuses, strict=True)
     return [
         (k, bound.cell, status) for k, (bound, status) in enumerate(bounds, 1) if status != "ok"
     ]

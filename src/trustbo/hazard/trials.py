@@ -94,7 +94,7 @@ class Trials(NamedTuple):
 def _reported(mission: Mission) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds with a known outcome, (bound, 4), and whether each one failed."""
     path = mission.path
-    statuses = [*(bound.status for bound in mission.bounds[:-1]), mission.status]
+    statuses = mission.statuses
 
     fails = np.array([status in CAUSES for status in statuses])
     is_known = fails.copy()
