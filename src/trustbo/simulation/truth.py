@@ -23,7 +23,7 @@ from trustbo.simulation.protocol import digest, require_path
 from trustbo.simulation.replicates import replicated
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import END, MOVES, bounds_and_next
+from trustbo.workspace.moves import END, MOVES, bounds_and_next, by_cell_left
 
 
 class Truth(Summary):
@@ -230,7 +230,7 @@ def _most_kept(
     first = []  # first move of these paths
     choices = []  # next move after each bound
     for _ in range(longest):
-        onward = np.stack([_by_cell_left(value[move], move) for move in range(END)])
+        onward = by_cell_left(value, -np.inf)
         first.append(int(onward[:, *start].argmax()))
         most.append(onward[first[-1], *start])
 
@@ -253,11 +253,3 @@ def _most_kept(
         if choice is not None:
             move = int(choice[move, *path[-1]])
     return tuple(path)
-
-
-def _by_cell_left(values: np.ndarray, move: int) -> np.ndarray:
-    """Index the values (row, col) of a move by the cell left instead of the cell entered."""
-    down, right = MOVES[move]
-    rows, cols = values.shape
-    framed = np.pad(values, 1, constant_values=-np.inf)
-    return framed[1 + down :, 1 + right :][:rows, :cols]

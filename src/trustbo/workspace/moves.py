@@ -72,13 +72,21 @@ def possible_next(bounds: np.ndarray) -> np.ndarray:
     Args:
         bounds: Whether each bound exists, shape (move, row, col).
     """
-    _, rows, cols = bounds.shape
-    framed = np.pad(bounds, ((0, 0), (1, 1), (1, 1)))
-    onward = [
-        framed[n, 1 + down :, 1 + right :][:rows, :cols] for n, (down, right) in enumerate(MOVES)
-    ]
-    anything = np.ones((rows, cols), bool)  # a path can end in any cell
+    onward = by_cell_left(bounds, False)
+    anything = np.ones(bounds.shape[1:], bool)  # a path can end in any cell
     return bounds[..., None] & np.stack([*onward, anything], axis=-1)
+
+
+def by_cell_left(values: np.ndarray, nowhere: float) -> np.ndarray:
+    """Index values (move, row, col) of bounds by the cell left instead of the cell entered.
+
+    Moves that leave the grid have the value `nowhere`.
+    """
+    _, rows, cols = values.shape
+    framed = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=nowhere)
+    return np.stack([
+        framed[m, 1 + down :, 1 + right :][:rows, :cols] for m, (down, right) in enumerate(MOVES)
+    ])  # fmt: skip
 
 
 def existing_bounds(passable: np.ndarray) -> np.ndarray:
