@@ -14,12 +14,11 @@ fraction above the crown base, plus the fraction below the surface, minus 1.
 import math
 
 import numpy as np
-from numba import njit
 
-from trustbo.kernels import PART, kernel
+from trustbo.kernels import kernel, part
 
 _kernel = kernel(fastmath={"contract", "nsz", "arcp"})
-_part = njit(nogil=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"}, **PART)
+_part = part(fastmath={"contract", "nsz", "arcp"})
 BLOCK = 4
 """Side of the squares of pixels that share one value of openness."""
 _GRAZING = -1e-9  # m; rays that are lower above the ground are blocked

@@ -7,9 +7,8 @@ that a robot drives by it without wheel slip, which cuts the corners of the rout
 import math
 
 import numpy as np
-from numba import njit
 
-from trustbo.kernels import PART, kernel
+from trustbo.kernels import kernel, part
 from trustbo.team import Robot
 from trustbo.terrain.pixels import nearest_pixel
 from trustbo.workspace.routes import SLOWEST, speed_share
@@ -30,7 +29,7 @@ _SLIP = 0.05
 _TICK = 0.5
 """Length of a tick of `largest_tilt`, s."""
 _compiled = kernel()
-_part = njit(nogil=True, error_model="numpy", **PART)
+_part = part()
 
 
 def steps_per_tick(robot: Robot, tick: float) -> int:

@@ -10,10 +10,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy import ndimage
 
-from trustbo.kernels import PART, kernel
+from trustbo.kernels import kernel, part
 from trustbo.parallel import plain
 from trustbo.team import Robot
 from trustbo.terrain.pixels import nearest_pixel
@@ -27,7 +26,7 @@ _CLEARANCE = 1.0  # preferred distance from obstacles, because robots stray from
 _TIE = 1e-9  # m on level ground; costs that differ by less are equal but for rounding
 _CLOSE = 4.0  # factor on the cost of a route that is closer to an obstacle
 _compiled = kernel()
-_part = njit(nogil=True, error_model="numpy", **PART)
+_part = part()
 
 
 class Routes:

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numba import njit
 
 from trustbo.errors import require_positive, require_share
-from trustbo.kernels import PART, kernel
+from trustbo.kernels import kernel, part
 from trustbo.parallel import plain
 from trustbo.team import Robot
 from trustbo.terrain import rays
@@ -16,7 +15,7 @@ from trustbo.terrain.pixels import index_within, row_and_col
 from trustbo.workspace.surface import Surface
 
 _compiled = kernel()
-_part = njit(nogil=True, error_model="numpy", **PART)
+_part = part()
 
 _JITTER = 0.7  # radius of the disc of viewpoints around a post, m
 _GOLDEN_ANGLE = 2.4  # between successive viewpoints, rad (Vogel 1979)
