@@ -1,4 +1,4 @@
-"""Properties that are computed once, until the missions of a campaign change."""
+"""Properties that are cached until the missions of a campaign change."""
 
 from collections.abc import Callable
 from typing import Any, Self, overload
@@ -7,7 +7,7 @@ from typing import Any, Self, overload
 class computed[T]:  # noqa: N801  (used as a decorator, like `property`)
     """Property that is computed on first access, one thread at a time.
 
-    The object needs an attribute `_turn`, a reentrant lock between threads, and `_computed`, a
+    The object needs two attributes: `_turn`, a reentrant lock between threads, and `_computed`, a
     dictionary of the values. To compute all properties again, clear this dictionary.
     """
 

@@ -70,8 +70,9 @@ class Campaign(Result):
     `ask` plans a path, and `tell` records the mission on this path and learns from it. With a
     `directory`, each mission is written to disk before the posterior is updated, and
     `Campaign.load` continues after a crash with identical results. An operation that raises an
-    error has recorded nothing and can be repeated. If something fails later, such as the writing of
-    the posterior, the mission is recorded, a warning says so, and the next call makes up for it.
+    error has recorded nothing and can be repeated. If a later step fails, such as writing the
+    posterior, the mission is already recorded. A warning then says so, and the next call repeats
+    the step.
 
     All methods can be called from any thread; they run one at a time.
 
@@ -107,7 +108,7 @@ class Campaign(Result):
     ) -> None:
         """Check the arguments and prepare the campaign; no path is planned yet.
 
-        With `earlier`, the campaign learns from the missions of earlier campaigns first.
+        With `earlier`, the campaign first learns from the missions of earlier campaigns.
 
         Args:
             workspace: Workspace of the paths.
@@ -116,8 +117,9 @@ class Campaign(Result):
             model: Trust model, or a NumPyro function `model(awareness, contact_rate=None)`; by
                 default `models.default_model()`, with place and robot effects.
             policy: Name in `planning.POLICIES`, or a callable `policy(rng, draws, planner)` that
-                returns a Plan; see `planning.policies`. The default is the best path under the
-                posterior mean, until it repeats itself although it may not be the best.
+                returns a Plan; see `planning.policies`. By default, the best path under the
+                posterior mean is taken until it repeats itself although it may not be the best; see
+                `planning.policies.explore`.
             objective: Objective of the paths; see `planning.Planner`.
             sampler: Sampler of the posterior; by default as in `trustbo.fit`.
             seed: Seed of all random numbers.
@@ -127,24 +129,26 @@ class Campaign(Result):
                 of this process uses the folder, it is closed.
             initial: Parameters for the first plan: `"prior_mean"`, or `"prior_draw"` for one random
                 draw from the prior, as in the paper.
-            awareness: Awareness from which the model learns: `"map"` for that of the workspace, or
-                `"measured"`, as in the paper, for the measured awareness where it is finite, and
-                that of the workspace elsewhere. Plans use the workspace's.
+            awareness: Awareness from which the model learns. With `"map"`, it is the awareness of
+                the workspace. With `"measured"`, as in the paper, it is the measured awareness
+                where that is finite, and the awareness of the workspace elsewhere. Plans always use
+                the awareness of the workspace.
             hazard: Priors of the probability that a bound fails; by default `Hazard()`.
             planner: Further options of `planning.Planner`, such as `{"max_failure": 0.1}`. Failures
                 have no cost until the first one is recorded, unless `failure_cost` is given.
             fit: Further options of `trustbo.fit`, such as `{"draws": 500}`.
-            earlier: Results or campaigns whose missions are data of this one, so that their
-                posterior is its prior. They may have other courses, terrains and teams. Robots are
-                matched by name. What was learned about places is used only if the map is the same.
-            progress: Whether to show progress bars of slow fits.
+            earlier: Results or campaigns whose missions are also data of this campaign, so that
+                their posterior is its prior. They may have other courses, terrains and teams.
+                Robots are matched by name. What was learned about places is used only if the map is
+                the same.
+            progress: Whether to show progress bars for slow fits.
 
         Raises:
             TrustboError: The start or goal is not a passable cell, a name is unknown, the sampler
                 does not support the model, an option cannot be stored in a file, or the folder
-                already contains a campaign or cannot be written. Or an earlier campaign has other
-                features, no robot of the team, or no mission to learn from, or the model cannot be
-                fitted to its missions.
+                already contains a campaign or cannot be written. The same error is raised if an
+                earlier campaign has other features, shares no robot with the team, or has no
+                mission to learn from, or if the model cannot be fitted to its missions.
             NoPathError: The goal cannot be reached.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
@@ -245,7 +249,7 @@ class Campaign(Result):
                 raise
 
     def _catch_up(self) -> None:
-        """Learn from the missions, if an earlier call could not."""
+        """Learn from the missions if an earlier call could not."""
         state = self.state
         if state.due is None:
             return
@@ -276,7 +280,7 @@ class Campaign(Result):
             )
 
     def _use_posterior(self, tree: xr.DataTree, n_used: int) -> None:
-        """Make a posterior of `n_used` missions the one after the last mission."""
+        """Store a posterior of `n_used` missions as the one after the last mission."""
         state = self.state
         for j in state.indices(TOLD):
             state.entries[j].become(LEARNED)
@@ -288,9 +292,9 @@ class Campaign(Result):
         last.posterior = Posterior(f"{len(state.entries):04d}{suffix}", tree)
 
     def _finish(self, what: str) -> None:
-        """Learn and write after something was recorded, whose description is `what`.
+        """Learn and write after something was recorded; `what` describes it in messages.
 
-        What fails here is made up for by the next call, so it must not look like a failed call.
+        The next call repeats what fails here, so a failure must not look like a failed call.
         """
         try:
             self._catch_up()
@@ -380,11 +384,12 @@ class Campaign(Result):
     ) -> Plan:
         """Plan the rest of the mission in progress; `ask` then returns the new plan.
 
-        The path of the plan consists of the cells so far and the new rest. The policy plans the
-        rest with the trust and the parameters given the contact so far, and with the failure
-        probabilities given the bounds so far. The rest never takes a bound that failed in this
-        mission, in either direction. If a bound failed and the team is in the cell before, the path
-        first leads back from the cell that was not reached. Tell the mission as a whole.
+        The path of the plan consists of the cells so far and the new rest. To plan the rest, the
+        policy uses the trust and the parameters given the contact so far, and the failure
+        probabilities given the bounds so far. The rest never contains a bound that failed in this
+        mission, in either direction. If a bound failed and the team is in the previous cell, the
+        path first leads back there from the cell that was not reached. When the mission is over,
+        `tell` it as a whole.
 
         Args:
             cell: Cell in which the team is, or a position in it (see `Workspace.locate`).
@@ -394,9 +399,10 @@ class Campaign(Result):
                 remain blocked in this mission.
 
         Returns:
-            Plan of the whole mission. Trust after a bound so far is that of a `TrustFilter`. The
-            value of `lost_contact` includes the contact lost so far; the other values, `p_arrive`
-            and the limits `max_failure` and `max_bounds="shortest+n"` are those of the rest.
+            Plan of the whole mission. Trust after each of the bounds so far is that of a
+            `TrustFilter`. The value of `lost_contact` includes the contact lost so far. The values
+            of other objectives, `p_arrive`, and the limits `max_failure` and
+            `max_bounds="shortest+n"` refer to the rest.
 
         Raises:
             TrustboError: The mission does not start where the plan starts or does not end in
@@ -480,8 +486,8 @@ class Campaign(Result):
 
         Args:
             mission: Measured mission, whether or not it reached the goal.
-            again: Whether to accept a mission with the same data as an earlier one. Without it,
-                such a mission is refused, since it was probably told twice.
+            again: Whether to accept a mission with the same data as an earlier one. By default,
+                such a mission is refused, because it was probably told twice.
 
         Returns:
             Posterior of the parameters given all usable missions. If this mission cannot be used
@@ -503,7 +509,8 @@ class Campaign(Result):
             if not again:
                 self._require_new(mission)
 
-            # If nothing was asked since the last mission, this plans a path, which may take long.
+            # If no path was asked for since the last mission, one is planned here, which may be
+            # slow.
             plan = self.state.asked or self._with_bands(self._propose())
             if mission.path[0] != plan.path[0]:
                 raise TrustboError(
@@ -543,7 +550,7 @@ class Campaign(Result):
                 )
 
     def _add(self, entry: Entry) -> None:
-        """Add a mission that is on disk to the state; the fit is then due."""
+        """Add a mission that is on disk to the state, and mark the fit as due."""
         state = self.state
         entry.posterior = state.last
         seed = state.seed_of("fit")
@@ -608,7 +615,8 @@ class Campaign(Result):
 
         Args:
             reason: Reason to store in the table of missions. Only a reason in `hazard.CAUSES`, such
-                as "stuck", means that a bound of the plan failed, and is used to learn the hazard.
+                as "stuck", means that a bound of the plan failed; the hazard is learned from no
+                other reasons.
             where: Cell that the team failed to enter, if known.
 
         Raises:
@@ -672,7 +680,7 @@ class Campaign(Result):
         return self._run(runner, n_iterations, stop)
 
     def _usual_simulator(self) -> Simulator:
-        """Make the default simulator, in which robots measure awareness if it is learned from."""
+        """Make the default simulator; robots measure awareness if the campaign learns from it."""
         simulator = KinematicSimulator(self.workspace)
         if self.state.settings["awareness"] == "measured":
             return RealtimeAwareness(simulator)
@@ -727,8 +735,8 @@ class Campaign(Result):
             model: Model of the campaign; required if the model or its priors are custom, or if it
                 is a NumPyro function.
             policy: Policy of the campaign; required if it is a custom function.
-            progress: Whether to say that missions are used now, and to show progress bars; also for
-                later calls.
+            progress: Whether to report missions that are used now and to show progress bars, in
+                this call and in later ones.
 
         Raises:
             TrustboError: The folder contains no campaign or is locked by another process, a custom

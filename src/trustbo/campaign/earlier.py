@@ -1,7 +1,7 @@
 """Missions of earlier campaigns, which are data of a new campaign.
 
 By Bayes' rule, the posterior of an earlier campaign, taken as the prior of a new one, gives the
-posterior given the missions of both. So the earlier missions enter every fit.
+posterior given the missions of both. The earlier missions therefore enter every fit.
 """
 
 import json
@@ -38,8 +38,8 @@ def earlier_missions(
     still earlier campaigns. Missions on the map of the workspace have the map "".
 
     Raises:
-        TrustboError: It is not a result; its features differ from the workspace's, or no robot has
-            a name in the workspace's team; or it has no mission to learn from.
+        TrustboError: An entry is not a result, its features differ from the workspace's, none of
+            its robots has a name in the workspace's team, or it has no mission to learn from.
     """
     # Imported here because results have earlier missions themselves.
     from trustbo.campaign.result import Result
@@ -69,7 +69,7 @@ def earlier_missions(
 
 
 def _missions_of(result: "Result") -> EarlierMissions:
-    """Return the missions of a result that can be learned from, its own earlier ones first."""
+    """Return the missions of a result to learn from, starting with its own earlier ones."""
     state = result.state
     own = [entry.mission for entry in state.entries if not is_excluded_by_user(entry)]
     return EarlierMissions((*state.earlier.missions, *own), tuple(state.lost))

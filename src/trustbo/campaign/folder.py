@@ -8,10 +8,10 @@
     campaign.json         settings, the rows of completed missions, failures, and hashes of the
                           other files; written last
 
-Every file is written under a temporary name, flushed to disk and renamed. A mission is recorded
-when its file has its name. Everything else is recorded when campaign.json is replaced. If the
-process dies, no mission is lost: `Campaign.load` learns from the missions that are not in
-campaign.json yet.
+Every file is written under a temporary name, flushed to disk and renamed. A mission counts as
+recorded once its file has been renamed. Everything else counts as recorded once campaign.json has
+been replaced. If the process dies, no mission is lost: `Campaign.load` learns from the missions
+that are not in campaign.json yet.
 """
 
 from collections.abc import Iterator
@@ -128,7 +128,7 @@ class FolderStorage:
         """Raise TrustboError if the campaign was closed, or if others have changed its folder."""
         path = self._lock.require()
         found = _version_of(path / RECORD)
-        # A record that is missing is written again; another record belongs to somebody else.
+        # A missing record is written again; a different record was written by somebody else.
         if found is not None and found != self._written:
             raise TrustboError(
                 f"{str(path / RECORD)!r} was changed by another program while the campaign was "
@@ -168,7 +168,7 @@ class FolderStorage:
         self._lock.release()
 
     def _write(self, name: str, content: bytes) -> StoredFile:
-        """Write a file in the folder, which is never created again if it was moved."""
+        """Write a file in the folder; if the folder was moved, it is not created again."""
         stored = _write_stored(self.path, name, content)
         self.files[name] = stored.sha256
         return stored
@@ -209,7 +209,7 @@ def _contents(workspace: Workspace, state: State) -> Iterator[tuple[str, bytes]]
 
 
 def _content_of(posterior: Posterior) -> bytes:
-    """Return the content of a posterior's file; a file is copied, so that it keeps its hash."""
+    """Return the content of a posterior's file; an existing file is copied and keeps its hash."""
     if posterior.file is not None:
         try:
             return read_file(*posterior.file)
@@ -258,7 +258,7 @@ def _write_first(folder: Path, workspace: Workspace, state: State) -> dict[str, 
     """Write a campaign to a folder that contains none, and return the hashes of its files.
 
     If this fails, the files are removed again. Files with these names that exist already are
-    replaced only if they have the same content, as after a process that died here.
+    replaced only if they have the same content, as when an earlier process died here.
     """
     files: dict[str, str] = {}
     written: list[Path] = []
@@ -281,7 +281,7 @@ def _write_first(folder: Path, workspace: Workspace, state: State) -> dict[str, 
 
 
 def _replace_campaign(folder: Path, workspace: Workspace, state: State) -> dict[str, str]:
-    """Write a campaign beside the one in the folder, and then replace that one."""
+    """Write a campaign beside the one in the folder, and then replace the old one."""
     old = recorded_files(folder)
     beside = new_folder(folder)
     try:
@@ -324,7 +324,7 @@ def _require_no_campaign(path: Path) -> None:
 
 
 def _has_content(file: Path, content: bytes) -> bool:
-    """Return whether a netCDF file has the same values; the bytes contain the time of writing."""
+    """Compare a netCDF file by its values, because the bytes contain the time of writing."""
     try:
         return read_tree(file).identical(tree_from_bytes(content))
     except TrustboError:

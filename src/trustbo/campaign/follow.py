@@ -58,7 +58,7 @@ class Follower(Summary):
         self._is_over = False  # whether a bound failed, after which nothing was planned
         start = trust_filter(campaign)
 
-        # `_before` has the bounds that have ended, and `_now` also the bound in progress.
+        # `_before` covers the bounds that have ended; `_now` also covers the bound in progress.
         self._before = self._now = start
         self.trust: TrustState = start.state
         self._started = self._begun = self._last = -np.inf  # times of start and last call
@@ -118,9 +118,9 @@ class Follower(Summary):
 
         Args:
             t: Time, s.
-            in_contact: 1 for each robot that has contact with the lead, 0 for the others, and NaN
-                where it was not measured, shape (robot,). A Series, a DataArray or a dict is read
-                by the names of the robots.
+            in_contact: Contact of each robot with the lead, shape (robot,): 1 for contact, 0 for no
+                contact, and NaN where not measured. A Series, a DataArray or a dict is read by the
+                names of the robots.
 
         Raises:
             TrustboError: No bound is in progress, a value is not 0, 1 or NaN, the number of values
@@ -163,13 +163,13 @@ class Follower(Summary):
     ) -> Plan:
         """Plan the rest of the mission from the bounds so far, and follow the new plan.
 
-        After a bound that failed, the rest avoids this bound. If the team is in the cell before,
-        the next bound of `path` leads back there, and its ticks count like those of other bounds.
-        If the team is back already, call `begin` and `end` without ticks.
+        After a bound has failed, the rest avoids it. If the team is in the previous cell, the next
+        bound of `path` leads back there, and its ticks count like those of other bounds. If the
+        team is already back, call `begin` and `end` without ticks.
 
         Args:
-            cell: Cell in which the team is; by default the cell of the last bound or, if this bound
-                failed, the cell before.
+            cell: Cell in which the team is; by default the cell of the last bound or, if that bound
+                failed, the cell before it.
             blocked: Further bounds that cannot be driven; see `Campaign.replan`.
 
         Returns:
@@ -177,7 +177,7 @@ class Follower(Summary):
 
         Raises:
             TrustboError: A bound is in progress, or `Campaign.replan` raises an error. The follower
-                is then as before.
+                is then unchanged.
         """
         self._require(running=False, t=self._last if self.bounds else 0.0)
         n = len(self.bounds)

@@ -18,9 +18,9 @@ from trustbo.stacking import pooled
 from trustbo.workspace import Workspace
 
 _N_RISKS = 200
-"""Posterior draws of the failure probabilities."""
+"""Number of posterior draws of the failure probabilities."""
 _STOPPED = 2
-"""Failures after which a bound is avoided."""
+"""Number of failures after which a bound is avoided."""
 _RECOVERED = 0.2
 """Failure probability below which such a bound is allowed again."""
 _HOPELESS = 0.9
@@ -37,8 +37,8 @@ def as_learned(mission: Mission, workspace: Workspace, awareness: str = "map") -
     Args:
         mission: Mission with the awareness that was measured, NaN where it was not.
         workspace: Workspace of the mission.
-        awareness: `"map"` for the awareness of the map, which the planner uses, too; `"measured"`
-            for the measured one. The other source is used where this one is NaN.
+        awareness: `"map"` for the awareness of the map, which the planner also uses; `"measured"`
+            for the measured awareness. Where this source is NaN, the other one is used.
 
     Raises:
         TrustboError: The path leaves the grid or skips cells.
@@ -139,9 +139,10 @@ def _previous(state: State) -> xr.DataTree | None:
 def learn_hazard(state: State, workspace: Workspace, so_far: Mission | None = None) -> xr.Dataset:
     """Fit the failure probabilities of bounds to all missions; see `fit_hazard`.
 
-    Missions that cannot be used for learning trust are included, since they show where the team
-    failed. So are missions of earlier campaigns on the same map, and the bounds `so_far` of a
-    mission in progress. If the diagnostics fail, the previous posterior is returned with a warning.
+    Missions that cannot be used for learning trust are included, because they show where the team
+    failed. Missions of earlier campaigns on the same map and the bounds `so_far` of a mission in
+    progress are included as well. If the diagnostics fail, the previous posterior is returned with
+    a warning.
     """
     measured = [mission for mission in state.earlier.missions if not mission.map]
     measured += [entry.measured for entry in state.entries if not is_excluded_by_user(entry)]
@@ -163,13 +164,13 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     """Make a planner that accounts for the failure probabilities of bounds.
 
     A bound that failed twice is avoided unless there is no other path, or its failure probability
-    has fallen below 0.2. If failures have a cost, it is avoided only if this applies to all of its
-    next moves, since the search weighs the others by their cost.
+    has fallen below 0.2. If failures have a cost, a bound is avoided only if this applies with all
+    of its next moves, because the search accounts for the others by their cost.
 
     Before the first failure, the user's slope limit is trusted, and failures have no cost unless
     the user gave `failure_cost`. Under the prior alone, a cost would rule out longer paths that
-    keep contact and never fail. The cost is computed jointly over components of
-    the hazard posterior, since all bounds share the slope limit.
+    keep contact and never fail. The cost is computed jointly over components of the hazard
+    posterior, because all bounds share the slope limit.
     """
     n_failures = risk.stopped + 1e-9  # expected numbers, with rounding errors
     stopped = (n_failures >= _STOPPED) & ~(risk.mean < _RECOVERED)
@@ -193,7 +194,7 @@ def instead_of_failure(planner: Planner, plan: Plan, draws: Draws) -> Plan:
     """Return the plan, or the safest one if the plan almost certainly fails.
 
     If all paths are likely to fail, their costs of failure are nearly equal, so that the plan would
-    minimise lost contact again. Applies only if failures have a cost.
+    minimise lost contact again. This function has an effect only if failures have a cost.
 
     Args:
         planner: Planner of `informed_planner`.

@@ -59,10 +59,10 @@ class FolderLock:
         lock = FileLock(self.path / LOCK, timeout=0, thread_local=False)
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # filelock's own words on missing locks
+                warnings.simplefilter("ignore")  # filelock's own warning about missing locks
                 lock.acquire()
         except Timeout:
-            # On ENOSYS, filelock turns into a lock that takes any copied `.lock` for a live one.
+            # On ENOSYS, filelock becomes a lock that mistakes any copied `.lock` for a live one.
             if not isinstance(lock, SoftFileLock):
                 raise TrustboError(
                     f"another campaign is using {str(self.path)!r}; close it first "

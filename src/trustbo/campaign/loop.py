@@ -46,7 +46,8 @@ def iterate(
             `seed`, `initial`, `awareness`, `hazard`, `planner`, `fit` and `earlier`.
 
     Returns:
-        Campaign after the last mission, whose properties are the results; a `directory` is closed.
+        Campaign after the last mission; its properties are the results. A campaign with a
+        `directory` has been closed.
 
     Raises:
         TrustboError: The input is invalid or the folder has a campaign; raised before any work.

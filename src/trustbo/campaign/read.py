@@ -27,7 +27,7 @@ from trustbo.workspace.netcdf import workspace_from_tree
 
 
 def lock_campaign(directory: FilePath) -> FolderLock:
-    """Lock the folder of a campaign, and finish what a process that died has begun there.
+    """Lock the folder of a campaign, and finish what a process began there before it died.
 
     An older campaign of this process that uses the folder is closed.
 

@@ -100,7 +100,7 @@ def state_from_record(record: dict[str, Any], workspace: Workspace) -> State:
 
 
 def _series(version: str) -> list[str]:
-    """Return the major and the minor number; other numbers do not change the folder."""
+    """Return the major and minor numbers; the format of the folder depends on no others."""
     return version.split(".")[:2]
 
 

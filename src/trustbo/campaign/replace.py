@@ -1,9 +1,10 @@
 """Replacement of the campaign in a folder by another one, as one operation.
 
 The new campaign is written to a folder `.new-*` inside the campaign's folder. When it is complete
-on disk, this folder gets the name `.next`: from then on, the new campaign counts. The files of the
-old campaign are then deleted, and the new ones move to their places. If the process dies between,
-the next one that opens the folder goes on. Only files that the old campaign lists are deleted.
+on disk, this folder is renamed to `.next`: from then on, the new campaign is the valid one. The
+files of the old campaign are then deleted, and the new ones are moved to their places. If the
+process dies in between, the next process that opens the folder continues. Only files that the old
+campaign lists are deleted.
 """
 
 import json
@@ -28,11 +29,11 @@ _NEXT = ".next"
 _TO_DELETE = "to-delete.json"
 """File in `.next` that lists the old files; it is removed when they are deleted."""
 _TO_MOVE = "to-move.json"
-"""File in `.next` that lists the new files; it is removed when they are in their places."""
+"""File in `.next` that lists the new files; it is removed when they are in place."""
 
 
 def is_being_replaced(folder: Path) -> bool:
-    """Return whether the campaign in a folder is being replaced, or this was interrupted."""
+    """Return whether replacing the campaign in a folder is in progress or was interrupted."""
     return (folder / _NEXT / _TO_MOVE).exists()
 
 
@@ -80,7 +81,7 @@ def new_folder(folder: Path) -> Path:
 
 
 def commit_replacement(folder: Path, new: Path, old: Iterable[str], files: Iterable[str]) -> None:
-    """Let the complete campaign in the folder `new` count instead of the one in `folder`.
+    """Make the complete campaign in the folder `new` valid instead of the one in `folder`.
 
     Args:
         folder: Folder of the campaign.
@@ -88,7 +89,7 @@ def commit_replacement(folder: Path, new: Path, old: Iterable[str], files: Itera
         old: Files to delete; see `recorded_files`.
         files: Files of the new campaign, without campaign.json.
     """
-    # The record stays to the end: it is replaced, not deleted.
+    # The record is kept until the end: it is replaced, not deleted.
     write_text(new / _TO_DELETE, to_json([name for name in old if name != RECORD]))
     write_text(new / _TO_MOVE, to_json([*files, RECORD]))
     try:
@@ -99,7 +100,7 @@ def commit_replacement(folder: Path, new: Path, old: Iterable[str], files: Itera
 
 
 def finish_replacement(folder: Path) -> None:
-    """Delete the files of the old campaign and move the new ones, if a replacement counts.
+    """Delete the files of the old campaign and move the new ones, if a replacement is unfinished.
 
     If this fails, it can be called again.
     """
@@ -131,7 +132,7 @@ def finish_replacement(folder: Path) -> None:
 
 
 def recover(folder: Path) -> None:
-    """Finish or discard what processes that died have left in a folder that is locked."""
+    """Finish or discard what processes left in a locked folder when they died."""
     finish_replacement(folder)
     for path in (*folder.glob(f"{_NEW}*"), folder / _NEXT):
         remove_tree(path)

@@ -109,7 +109,7 @@ def _planned(path: tuple[Cell, ...], cell: Cell) -> tuple[Cell, ...]:
 
 
 def _returned(path: tuple[Cell, ...], cell: Cell, so_far: Mission) -> tuple[Cell, ...]:
-    """Return the path so far, with a bound back from the cell that the team did not reach."""
+    """Return the path so far, followed by a bound back from the cell that was not reached."""
     # If a mission stops after a bound that was completed, only the mission has another status.
     is_completed = so_far.bounds[-1].status == "ok" and so_far.status not in CAUSES
     possible = path[-1:] if is_completed else path[-2:]
@@ -129,7 +129,8 @@ def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:
     """Put the bounds so far before a plan of the rest.
 
     For an objective that measures contact, the contact lost so far is subtracted from the value.
-    Other objectives have the value of the rest. The failure probability of past bounds is 0.
+    For other objectives, the value is that of the rest. The failure probability of past bounds is
+    0.
 
     Args:
         problem: Planning problem of the campaign.

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     from trustbo.plots.explorer import Explorer
 
 _N_PRIOR_DRAWS = 1000
-"""Draws from the prior for `Result.trust` before anything was learned."""
+"""Number of prior draws for `Result.trust` before anything was learned."""
 _N_PRIOR_AHEAD = 250
-"""The same for bands, with place effects of all cells, which are large."""
+"""Number of prior draws for bands; they contain place effects of all cells, which are large."""
 _FIRST_COLUMNS = (
     "mission",
     "status",
@@ -186,7 +186,7 @@ class Result(Summary):
 
     @computed
     def forecast(self) -> Draws:
-        """Draws like `belief`, with effects of robots in bounds and the next mission, for bands.
+        """Draws like `belief`, for bands: with effects of robots in bounds and the next mission.
 
         Before anything was learned, they are draws of the prior.
         """
@@ -271,11 +271,11 @@ class Result(Summary):
 
         Returns:
             Stationary trust of each posterior draw, as a DataArray with the dims (draw, robot, row,
-            col), without those of a robot or cell that is given; see `planning.Planner.trust`.
+            col). If a robot or cell is given, its dims are left out. See `planning.Planner.trust`.
 
         Raises:
-            TrustboError: If the robot or move is unknown, the cell is off the grid or impassable,
-                or no such bound enters the cell.
+            TrustboError: The robot or move is unknown, the cell is off the grid or impassable, or
+                no such bound enters the cell.
 
         Example:
             >>> trust = result.trust("r2", (3, 4))
@@ -332,13 +332,20 @@ class Result(Summary):
     def table(self) -> pd.DataFrame:
         """Return a table with one row per mission, labelled by its number, from 1.
 
-        The columns are `status`, `state` ("told", not used yet; "learned"; "excluded"; "given up",
-        see `Campaign.fail`, without a number), the `reason` for the state or the failure (else the
-        statuses of bounds that were not completed), the cells `where` a bound failed, the mean
-        `contact_rate`, the `objective` of the plan, the number `n_bounds` of bounds run,
-        `path_changed` (whether the plan differs from the previous one), the planned `path` as text,
-        "9,0 8,1", `contact_lost` in bounds (bounds that were not run lose all contact), and the
-        diagnostics of the posterior (see `fit`).
+        Missions given up with `Campaign.fail` have no number. The columns are:
+
+        - `status`: status of the mission.
+        - `state`: "told" (not used yet), "learned", "excluded" or "given up".
+        - `reason`: reason for the state or the failure; otherwise, the statuses of bounds that were
+          not completed.
+        - `where`: cells where a bound failed.
+        - `contact_rate`: mean contact rate.
+        - `objective`: value of the objective for the plan.
+        - `n_bounds`: number of bounds run.
+        - `path_changed`: whether the plan differs from the previous one.
+        - `path`: planned path as text, such as "9,0 8,1".
+        - `contact_lost`: contact lost, in bounds; bounds that were not run lose all contact.
+        - Diagnostics of the posterior; see `fit`.
         """
         entries = enumerate(self.state.entries, start=1)
         rows = [entry.shown_row | {"mission": n} for n, entry in entries]
@@ -413,8 +420,8 @@ class Result(Summary):
     def save(self, directory: FilePath, *, overwrite: bool = False) -> None:
         """Write the campaign to a folder that `load_result` and `Campaign.load` read.
 
-        An existing campaign in that folder is replaced only with `overwrite`, when the new one is
-        complete on disk. Other files in the folder are not changed.
+        An existing campaign in that folder is replaced only with `overwrite`, and only once the new
+        one is complete on disk. Other files in the folder are not changed.
 
         Args:
             directory: Folder to write to.
@@ -439,8 +446,8 @@ def load_result(
 
     Args:
         directory: Folder of a campaign, or a folder written by `Result.save`.
-        model: Model of the campaign; needed if it is a NumPyro function, or custom and nothing has
-            been learned.
+        model: Model of the campaign; needed if it is a NumPyro function, or if it is custom and
+            nothing has been learned.
         progress: Whether to show a progress bar if `posterior` takes longer than 5 seconds.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Settings of a campaign: its arguments, checked, and in the form in which they are stored."""
+"""Settings of a campaign: its arguments after checks, in the form in which they are stored."""
 
 import inspect
 import json
@@ -52,7 +52,7 @@ def to_settings(
     Args:
         base: Planner before any learning.
         learner: Learner of the model.
-        policy: Argument of `Campaign`, like all others.
+        policy: Policy that chooses the paths.
         objective: Objective of the paths.
         sampler: Sampler of the posterior.
         seed: Seed of all random numbers.

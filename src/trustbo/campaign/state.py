@@ -119,7 +119,7 @@ class Entry:
 
     @property
     def shown_row(self) -> dict[str, Any]:
-        """The row with the statuses of bounds that were not completed as the reason, if blank."""
+        """The row, where a blank reason is replaced by the statuses of incomplete bounds."""
         statuses = [status for _, _, status in incomplete_bounds(self.mission)]
         reason = self.row["reason"] or ", ".join(dict.fromkeys(statuses))
         return self.row | {"reason": reason}
@@ -134,7 +134,7 @@ class EarlierMissions(NamedTuple):
 
     Attributes:
         missions: Measured missions with the awareness used for learning. All have the same robots:
-            those of the campaign, and then the others.
+            those of the campaign, followed by the others.
         lost: Missions without measurements in which a bound of the campaign's map failed.
     """
 
@@ -152,7 +152,7 @@ class State:
         failures: Missions that were given up.
         asked: Plan returned by `ask` and not run yet.
         simulation: Settings reported by the simulator, and `n_iterations`.
-        stop_reason: Why the last run ended.
+        stop_reason: Reason why the last run ended.
         due: Seed of the fit that is due because the missions have changed; None if the posterior
             is up to date, or if learning is retried after the next mission.
         earlier: Missions of earlier campaigns, which enter every fit.
@@ -214,7 +214,7 @@ class State:
         before = self.entries[-1].plan if self.entries else plan
 
         n_planned = len(mission.path) - 1
-        if mission.path[-1] != plan.path[-1]:  # the goal was not in the path any more
+        if mission.path[-1] != plan.path[-1]:  # the path no longer contained the goal
             n_planned = max(n_planned, len(plan.path) - 1)
         rates = mission.contact_rate
         failed = [cell for _, cell, _ in incomplete_bounds(mission)]

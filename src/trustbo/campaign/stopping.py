@@ -17,7 +17,7 @@ Stop = Callable[["Campaign"], str | bool | None]
 """Function called between missions; returning a reason (or True) ends the campaign."""
 
 _N_DRAWS = 500
-"""Posterior draws under each of which the best path is planned."""
+"""Number of posterior draws; the best path is planned under each of them."""
 _N_SURE = 2
 """Successive missions after which the probability must be large enough."""
 
@@ -29,9 +29,10 @@ class RegretBound:
     The best path is planned exactly under each of a few hundred posterior draws. For lost_contact,
     the regret of the recommended path is the additional contact that it loses, as a fraction of the
     contact kept on the best path. For other objectives, regret is a fraction of the best path's
-    value. From the third mission on, the campaign stops if P(regret <= eps) >= 1 - delta after each
-    of the last two missions, and every bound of the recommended path has been completed at least
-    once, since the map may be wrong about bounds that were never driven.
+    value. From the third mission on, the campaign stops if two conditions hold: P(regret <= eps) >=
+    1 - delta after each of the last two missions, and every bound of the recommended path has been
+    completed at least once. The second condition is needed because the map may be wrong about
+    bounds that no robot has driven.
 
     Attributes:
         eps: Acceptable regret, as a fraction; 0.05 is 5 %.

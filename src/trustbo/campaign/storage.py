@@ -1,4 +1,4 @@
-"""What a campaign needs of its storage, and the storage of a campaign in memory."""
+"""Protocol for the storage of a campaign, and storage in memory."""
 
 import threading
 from typing import Protocol
@@ -16,19 +16,19 @@ class Storage(Protocol):
     turn: threading.RLock
 
     def require_open(self) -> None:
-        """Raise TrustboError if nothing can be recorded, for example because it is closed."""
+        """Raise TrustboError if nothing can be recorded, for example after `close`."""
         ...
 
     def add_mission(self, n: int, entry: Entry) -> None:
-        """Record mission n, counted from 1; if this raises TrustboError, it is not recorded."""
+        """Record mission n, counted from 1; after a TrustboError, it is not recorded."""
         ...
 
     def write(self, state: State) -> None:
-        """Record everything else; if this raises TrustboError, the earlier record is unchanged."""
+        """Record everything else; after a TrustboError, the earlier record is unchanged."""
         ...
 
     def close(self) -> None:
-        """Release the storage; what can be shared with others is then not written any more."""
+        """Release the storage; if others can use it too, it is not written any more."""
         ...
 
 
