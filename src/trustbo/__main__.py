@@ -1,4 +1,4 @@
-"""`python -m trustbo`, where the script `trustbo` is not on the path."""
+"""Entry point of `python -m trustbo`, for use if the script `trustbo` is not on the path."""
 
 from trustbo.cli import main
 

@@ -1,8 +1,8 @@
 """Read arrays of numbers by their dims and labels, from NumPy, xarray, pandas or a dict.
 
-Every argument that may carry names is read here, so that labels are honoured or refused, and never
-ignored: robots, features and moves are put in order by name, and bounds, rows and columns by
-number. Arrays without labels are read by place.
+Every argument that may carry names is read here. Labels are used or refused, but never ignored:
+robots, features and moves are put in order by name, and bounds, rows and columns by number. Arrays
+without labels are read by position.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,13 +23,13 @@ _TIMES = "mM"
 _NO_NUMBERS = (str, bytes, np.datetime64, np.timedelta64)
 """Types that are not numbers, although `float` converts them."""
 _FIRST = {"bound": (0, 1), "row": (0,), "col": (0,)}
-"""Numbers that the labels of an axis may begin with, of the axes that are numbered."""
+"""Numbers with which the labels of each numbered axis may begin."""
 _LARGEST = 1e12
 """Largest size of a parameter; trust near 1 added to it keeps four digits."""
 _SHARE_ROUNDING = 1e-6
-"""Largest distance of a value from [0, 1] that is rounding, as of means in single precision."""
+"""Largest distance of a value from [0, 1] that rounding may cause, as in single precision."""
 _CHOSEN = ("robot", "feature")
-"""Axes whose names the user chooses, or leaves out."""
+"""Axes whose names the user chooses or leaves out."""
 
 Names = tuple[str, ...]
 
@@ -54,11 +54,11 @@ def read_labelled(
     *,
     partial: bool = False,
 ) -> Labelled:
-    """Read an array by its dims and labels, and by place where it has none.
+    """Read an array by its dims and labels, or by position where it has none.
 
     Labels are the dims and coordinates of a DataArray, the index and the columns of a DataFrame,
     the index of a Series, or the keys of a dict. Whole numbers that count from 0 or 1 in order say
-    no more than the place, and may stand for names.
+    no more than the position, and may be given in place of names.
 
     Args:
         what: Name of the argument in messages.
@@ -73,8 +73,8 @@ def read_labelled(
             without labels is returned as it is, to be broadcast.
 
     Raises:
-        TrustboError: The dims are not those, a label is unknown, missing or repeated, or a value is
-            not a number.
+        TrustboError: The dims differ from `dims`, a label is unknown, missing or repeated, or a
+            value is not a number.
     """
     names = {} if coords is None else coords
     array = _as_dataarray(what, values, dims, names, partial)
@@ -112,7 +112,7 @@ def read_labelled(
 def as_array(what: str, values: ArrayLike) -> np.ndarray:
     """Return an array of floats, NaN where masked, without regard to labels.
 
-    Raises TrustboError for values that are no real numbers: text, dates, complex numbers, ragged
+    Raises TrustboError for values that are not real numbers: text, dates, complex numbers, ragged
     lists.
     """
     hint = ""
@@ -139,7 +139,7 @@ def require_numbers(what: str, values: ArrayLike, *, missing: bool = False) -> n
     Raises TrustboError for infinite values, values beyond 1e12 and, unless `missing`, NaN.
     """
     array = as_array(what, values)
-    low = np.fmin.reduce(array, axis=None, initial=0.0)  # of large arrays, without a copy
+    low = np.fmin.reduce(array, axis=None, initial=0.0)  # avoids a copy of large arrays
 
     high = np.fmax.reduce(array, axis=None, initial=0.0)
     if max(-low, high) > _LARGEST or (not missing and np.isnan(array.sum())):
@@ -155,7 +155,7 @@ def require_numbers(what: str, values: ArrayLike, *, missing: bool = False) -> n
 
 
 def without_rounding(values: np.ndarray) -> np.ndarray:
-    """Return values in which rounding has left [0, 1], such as 1.0000001, moved to 0 or 1.
+    """Move values that rounding has put outside [0, 1], such as 1.0000001, to 0 or 1.
 
     Other values outside [0, 1] are unchanged.
     """
@@ -246,10 +246,11 @@ def _axes_of(
     names: Mapping[str, Sequence[str] | None],
     partial: bool,
 ) -> dict[str, pd.Index]:
-    """Return the index, and the columns, of a table by the axis that they stand for.
+    """Return the index and any columns of a table, keyed by the axis that each stands for.
 
-    A Series has the axis that its labels or the name of its index say, else the first. A DataFrame
-    has the last two, in order unless the names of its index and columns say otherwise.
+    A Series has the axis given by its labels or by the name of its index, or else the first axis. A
+    DataFrame has the last two axes, in order unless the names of its index and columns say
+    otherwise.
     """
     if any(isinstance(axis, pd.MultiIndex) for axis in table.axes):
         raise TrustboError(
@@ -275,7 +276,7 @@ def _axes_of(
 
 
 def _by_name(what: str, dim: str, labels: list[Any], names: Names) -> tuple[list[int], Names]:
-    """Return the place of each name among the labels, and the names; no names if they count."""
+    """Return the position of each name among the labels, and the names; () if labels count."""
     is_text = [isinstance(label, str) for label in labels]
     is_whole = [isinstance(label, Integral) and not isinstance(label, bool) for label in labels]
     texts = [composed(str(label)) for label in labels]
@@ -283,7 +284,7 @@ def _by_name(what: str, dim: str, labels: list[Any], names: Names) -> tuple[list
     if len(set(texts)) == len(texts) and set(texts) == set(names):
         return [texts.index(name) for name in names], names
 
-    # Whole numbers in order say no more than the place.
+    # Whole numbers in order say no more than the position.
     counts = [list(range(first, first + len(labels))) for first in (0, 1)]
     if dim in _CHOSEN and all(is_whole) and labels in counts:
         return list(range(len(labels))), ()
@@ -298,7 +299,7 @@ def _by_name(what: str, dim: str, labels: list[Any], names: Names) -> tuple[list
 
 
 def _by_number(what: str, dim: str, labels: np.ndarray) -> list[int]:
-    """Return the place of each number, from the first to the last, if none is missing."""
+    """Return the position of each number, from the first to the last, if none is missing."""
     if labels.dtype.kind in "iuf":
         order = np.argsort(labels, kind="stable")
         if any(_counts(labels[order], first) for first in _FIRST[dim]):
@@ -309,7 +310,7 @@ def _by_number(what: str, dim: str, labels: np.ndarray) -> list[int]:
 
 
 def _require_in_order(what: str, dim: str, index: pd.Index) -> None:
-    """Raise TrustboError unless an index without a name agrees with the place of each row.
+    """Raise TrustboError unless an index without a name agrees with the position of each row.
 
     After a sort by another column, nobody can tell whether the rows or the index are in order.
     """
@@ -330,7 +331,7 @@ def _counts(labels: np.ndarray, first: Any) -> bool:
 
 
 def _are_times(dim: str, labels: np.ndarray) -> bool:
-    """Return whether labels are increasing times of bounds, and no numbers of bounds."""
+    """Return whether labels are increasing times of bounds rather than numbers of bounds."""
     if dim != "bound" or labels.dtype.kind not in "fmM":
         return False
     if labels.dtype.kind == "f" and (labels == np.round(labels)).all():

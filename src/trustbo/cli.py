@@ -27,7 +27,7 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as in a shell."""
 PLACE = "ROW,COL with row 0 in the north, x=...,y=... in CRS metres, or lon=...,lat=... (degrees)"
 _COLUMNS = ["status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed"]
-"""Columns of the table of missions that are printed."""
+"""Columns of the table of missions to print."""
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -198,7 +198,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _workspace(args: argparse.Namespace, *ends: Any, **features: Any) -> "Workspace":
-    """Make the workspace of the flags of `_add_workspace`; check the ends of paths first."""
+    """Make the workspace from the flags of `_add_workspace`, after a check of the ends of paths."""
     from math import radians
 
     import trustbo as tb
@@ -229,7 +229,7 @@ def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> No
 
 
 def _stop(args: argparse.Namespace) -> Any:
-    """Make the stopping rule of the flag `--stop-regret`; None without the flag."""
+    """Make the stopping rule from the flag `--stop-regret`; None without the flag."""
     from trustbo import RegretBound
 
     return None if args.stop_regret is None else RegretBound(eps=args.stop_regret)
@@ -246,7 +246,7 @@ def resume(args: argparse.Namespace) -> None:
 
 
 def _finish(result: "Result", folder: Path, quiet: bool) -> None:
-    """Write the report and, with a terrain, maps and path for GIS; print a summary."""
+    """Write the report and, with a terrain, the maps and the path for GIS; print a summary."""
     import matplotlib as mpl
 
     from trustbo.export import export_result

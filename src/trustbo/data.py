@@ -25,7 +25,7 @@ SHARE_TOLERANCE = 1e-6
 _USUAL_LEVELS = 7
 """Number of levels of the scales "likert" and "ordinal"."""
 LINE_OF_SIGHT = "line_of_sight"
-"""Feature name of the predicted contact rate; `line_of_sight_1`, `_2`, ... if several."""
+"""Feature name of the predicted contact rate; `line_of_sight_1`, `_2`, ... for several."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -119,10 +119,11 @@ class Mission(Summary):
     Attributes:
         path: Planned cells, start first, each (row, col); empty in a log without a map.
         bounds: Bounds that were run; bound k enters `path[k]`. If the mission ended early, there
-            are fewer bounds than planned, and the last one has the status of the mission. If it
-            continued after a bound that failed, the next bound starts in the cell of this bound; a
-            lead that did not stay there has first driven a bound back to the cell before.
-        status: `"ok"` if the mission reached the goal, else the reason why it did not.
+            are fewer bounds than planned, and the last one has the status of the mission. If the
+            mission continued after a bound that failed, the next bound starts in the cell of the
+            failed bound; a lead that did not stay there has first driven a bound back to the
+            previous cell.
+        status: `"ok"` if the mission reached the goal; otherwise, the reason why it did not.
         features: Names of the features, in the order of the last axis of `awareness`.
         robots: Names of the overwatching robots.
         scale: Scale of a person's trust reports, such as `"likert7"`, if `contact_rate` holds such
@@ -236,15 +237,15 @@ class Mission(Summary):
         Args:
             path: Planned cells, start first; None for a log without a map, which supports neither
                 planning nor place effects.
-            awareness: Shape (bound, robot, feature), in [0, 1]; any finite values in a log without
-                a map.
-            contact_rate: Shape (bound, robot), in [0, 1].
-            duration: Shape (bound, robot) or (bound,), s, or one number for each robot by name;
-                None where not recorded.
+            awareness: Situational awareness, shape (bound, robot, feature), in [0, 1]; any finite
+                values in a log without a map.
+            contact_rate: Contact rates, shape (bound, robot), in [0, 1].
+            duration: Running times in seconds, shape (bound, robot) or (bound,), or one number for
+                each robot by name; None if not recorded.
             status: Outcome of the mission, or the outcome of each bound if the mission continued
                 after a bound that failed.
             n_ticks: Number of ticks over which `contact_rate` is averaged, shape (bound, robot) or
-                (bound,); None where not recorded.
+                (bound,); None if not recorded.
             features: Names of the features; by default those of the labels, or traversability,
                 visibility, z3, ... (a workspace with the same number of features renames z3, ...).
             robots: Names of the robots; by default those of the labels, or r1, r2, ...
@@ -346,10 +347,10 @@ class Mission(Summary):
         return replace(self, bounds=tuple(bounds), **names)
 
     def with_robots(self, robots: Sequence[str]) -> Self:
-        """Return the mission with these robots, which include its own; others have no rates.
+        """Return the mission with these robots, which include its own; added robots have no rates.
 
-        The awareness of other robots is 0, which has no influence without rates. Ticks are left
-        out.
+        The awareness of added robots is 0, which has no influence because they have no rates. Ticks
+        are left out.
         """
         if tuple(robots) == self.robots:
             return self
@@ -406,7 +407,7 @@ class Mission(Summary):
         return self._stacked("n_ticks")
 
     def _stacked(self, name: str) -> np.ndarray:
-        """Stack an array of the bounds; cached, as every refit reads those of every mission."""
+        """Stack an array of the bounds; cached, because every refit reads all missions."""
         array = np.stack([getattr(bound, name) for bound in self.bounds])
         array.flags.writeable = False
         return array
@@ -511,7 +512,7 @@ def _unnamed(what: str, values: Any) -> np.ndarray:
 def _read(
     names: dict[str, tuple[str, ...]], what: str, values: Any, dims: Sequence[str]
 ) -> np.ndarray:
-    """Read an array in the order of `names`, and add its labels to names that are not known."""
+    """Read an array in the order of `names`; names that are not known come from its labels."""
     coords = {dim: names[dim] for dim in dims if dim in names}
     read = read_labelled(what, values, dims, coords)
     names |= read.coords

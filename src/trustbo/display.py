@@ -15,7 +15,7 @@ with warnings.catch_warnings():  # tqdm warns if ipywidgets is missing
 Rows = list[tuple[str, str]]
 """Names and values, with units, of the main properties of an object."""
 _WIDTH = 100
-_MAX_LINES = 3  # of a property
+_MAX_LINES = 3  # per property
 _PATIENCE = 5.0  # seconds of work before a progress bar appears
 
 

@@ -114,7 +114,7 @@ def require_positive(what: str, value: Any, *, or_zero: bool = False) -> float:
 def require_share(what: str, value: Any, *, ends: bool = True) -> float:
     """Return `value` as a float; raises TrustboError unless it is in [0, 1].
 
-    Without `ends`, 0 and 1 are refused, too.
+    Without `ends`, 0 and 1 are also refused.
     """
     number = _number(value)
     is_inside = 0.0 <= number <= 1.0 if ends else 0.0 < number < 1.0
@@ -157,7 +157,8 @@ def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
 def composed(name: str) -> str:
     """Return a name with composed letters (Unicode NFC).
 
-    An accented letter may be one character or two, as in names of files on macOS; both look alike.
+    An accented letter may be one character or two, as in names of files on macOS; the two forms
+    look alike.
     """
     return unicodedata.normalize("NFC", name)
 
@@ -213,7 +214,7 @@ def require_pair(what: str, value: object) -> tuple[int, int]:
 
 
 def require_bounds(what: str, value: object) -> tuple[tuple[tuple[int, int], ...], ...]:
-    """Return bounds as pairs of cells, that left and that entered; raises TrustboError if none."""
+    """Return bounds as pairs of cells (left, entered); raises TrustboError for other values."""
     remedy = "give pairs of neighbouring cells, such as [((2, 1), (1, 1))]"
     pairs = []
     for k, bound in enumerate(require_list(what, value, remedy=remedy)):
@@ -228,7 +229,7 @@ class Renamed:
     """Decorator for a function or class whose arguments got new names.
 
     A call with an old name raises a TrustboError that gives the new one. If a class is decorated,
-    its attributes have the new names, too.
+    its attributes also have the new names.
 
     Example:
         >>> @Renamed(whole="latent")
@@ -263,7 +264,7 @@ class Renamed:
 
 
 class OldName:
-    """Old name of an attribute or a constructor; a use raises an error that gives the new name.
+    """Old name of an attribute or a constructor; using it raises an error with the new name.
 
     Example:
         >>> class Priors:

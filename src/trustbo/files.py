@@ -27,7 +27,7 @@ def to_path(path: FilePath) -> Path:
     """Return a path with `~` expanded.
 
     Raises:
-        TrustboError: The path is not a text or a path, or it is empty, or no file can have it.
+        TrustboError: The path is not text or a path object, it is empty, or no file can have it.
     """
     text = os.fspath(path) if isinstance(path, str | PathLike) else None
     if not isinstance(text, str):

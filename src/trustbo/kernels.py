@@ -29,8 +29,8 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return the decorator of a function that only kernels call; see `kernel`.
 
-    It has no wrappers, which saves a quarter of the compile time, and is not cached on disk, but
-    its compiled callers are.
+    The function has no wrappers, which saves a quarter of the compile time. It is not cached on
+    disk, but its compiled callers are.
     """
     no_wrappers: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return njit(nogil=True, error_model="numpy", **no_wrappers, **options)

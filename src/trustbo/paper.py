@@ -4,7 +4,7 @@
     >>> result = tb.iterate(workspace, start, goal, **tb.paper.CAMPAIGN)
 
 The model, the objective, the policy, the first path and the sampler follow the paper. The list
-contains all known differences; the documentation gives the reasons.
+below contains all known differences; the documentation gives the reasons.
 
 Model:
 
@@ -12,19 +12,19 @@ Model:
   first bound is N(0.5, 0.5^2).
 - Latent trust is integrated out, which leaves the posterior unchanged.
 - The memory beta0 is in (0, 1); in the paper, it is any real number.
-- The variance of a contact rate includes the resolution of the rate, and not only delta_v^2.
+- The variance of a contact rate includes the resolution of the rate in addition to delta_v^2.
 
 Data:
 
-- Measured awareness, simulated by `simulation.RealtimeAwareness`, is used for learning, and the
-  awareness of the map for planning and where nothing was measured.
+- Measured awareness, simulated by `simulation.RealtimeAwareness`, is used for learning. The
+  awareness of the map is used for planning and where nothing was measured.
 - Each feature is a principal component as in the paper, but of clipped pixel features, and its sign
-  is declared instead of left to the solver.
+  is declared instead of being left to the solver.
 - While T2 closes up, contact is that of the lead's lidar, and counts in the rates of the robots.
-- The lead stops near the centre of the next cell, where the routes around are seen best.
+- The lead stops near the centre of the next cell, where the surrounding routes are seen best.
 - Campaigns learn from all missions at once. In the paper, the posterior is the prior of the next
-  iteration, and that of a given terrain is the prior on the mission terrain: pass the result on the
-  given terrain as `earlier=`.
+  iteration, and the posterior on a given terrain is the prior on the mission terrain. To do the
+  latter, pass the result on the given terrain as `earlier=`.
 
 Planning:
 

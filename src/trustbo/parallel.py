@@ -83,7 +83,7 @@ _LIMIT = _Limit()
 
 @lru_cache(1)
 def _controller(n_modules: int) -> ThreadpoolController:
-    """Find the BLAS libraries again if modules were imported, because finding them takes 3 ms."""
+    """Find the BLAS libraries, which takes 3 ms, again only if modules were imported."""
     return ThreadpoolController()
 
 

@@ -27,7 +27,7 @@ __dir__ = __all__.copy  # tab completion lists only public names
 _DRAWS = 50
 """Number of posterior draws for the uncertainty map."""
 _SHOWN = 3
-"""Number of bounds shown in detail, which are the bounds with the least trust."""
+"""Number of bounds shown in detail; these are the bounds with the least trust."""
 _ENDS = {"n_iterations": "all missions were run", "interrupted": "none; more missions can be run"}
 
 

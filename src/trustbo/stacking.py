@@ -11,8 +11,8 @@ from trustbo.errors import TrustboError, one_line, warn
 def known_awareness(missions: Sequence[Mission]) -> list[int]:
     """Return the indices of the missions whose awareness is known in all bounds.
 
-    Call this after the awareness of the map was filled in. A warning names the other missions, as
-    `Campaign.tell` does, which excludes them.
+    Call this function after the awareness of the map has been filled in. The other missions are
+    named in a warning, as in `Campaign.tell`, which excludes them.
     """
     known = [j for j, mission in enumerate(missions) if not np.isnan(mission.awareness).any()]
     unknown = sorted({*range(len(missions))} - {*known})
@@ -22,7 +22,7 @@ def known_awareness(missions: Sequence[Mission]) -> list[int]:
 
 
 def names_of_all(robots: Sequence[str], missions: Sequence[Mission]) -> tuple[str, ...]:
-    """Return names of robots, and then those of other robots in missions, in order."""
+    """Return names of robots, followed by those of other robots in missions, in order."""
     names = dict.fromkeys(robots)
     for mission in missions:
         names |= dict.fromkeys(mission.robots)
@@ -30,7 +30,7 @@ def names_of_all(robots: Sequence[str], missions: Sequence[Mission]) -> tuple[st
 
 
 def pooled(robots: Sequence[str], missions: Sequence[Mission]) -> list[Mission]:
-    """Return missions with the same robots: these robots, and then others in the missions."""
+    """Return missions with the same robots: these robots, followed by others in the missions."""
     every = names_of_all(robots, missions)
     return [mission.with_robots(every) for mission in missions]
 

@@ -35,9 +35,9 @@ class Robot:
         detection: Quality of the lidar: fraction of unobstructed scans that detect their target, in
             (0, 1].
         acquire: Number of successive scans that must detect a target before contact begins.
-        drop: Number of successive scans that must miss it before contact ends.
-        lookahead: Distance to the point of its route that the robot steers towards, m. A longer one
-            cuts corners more, so that the robot drives over other ground than its route.
+        drop: Number of successive scans that must miss a target before contact ends.
+        lookahead: Distance to the point of its route that the robot steers towards, m. With a
+            longer distance, the robot cuts corners more and drives over ground off its route.
 
     Raises:
         TrustboError: A value is not positive, an angle exceeds 90 degrees, a fraction exceeds 1, or
