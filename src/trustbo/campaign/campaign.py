@@ -614,9 +614,9 @@ class Campaign(Result):
         If bounds were run, `tell` a mission with these bounds and its status instead.
 
         Args:
-            reason: Reason to store in the table of missions. Only a reason in `hazard.CAUSES`, such
-                as "stuck", means that a bound of the plan failed; the hazard is learned from no
-                other reasons.
+            reason: Reason to store in the table of missions. Reasons in `hazard.CAUSES`, such as
+                "stuck", mean that a bound of the plan failed, and only these are used to learn the
+                hazard.
             where: Cell that the team failed to enter, if known.
 
         Raises:
