@@ -28,14 +28,14 @@ def export_result(
 ) -> list[Path]:
     """Write a result to a folder in several formats, and return the paths written.
 
-    For a result or a campaign, geojson and nav2 contain the recommended path. The next path of a
-    campaign, which may differ, is written with `campaign.ask()`.
+    For a result or a campaign, geojson and nav2 contain the recommended path. To write the next
+    path of a campaign, which may differ, pass `campaign.ask()`.
 
     Args:
         result: Result or campaign; or a plan, which has neither maps nor missions.
         folder: Folder to write to.
-        formats: Some of geotiff, geojson, csv and nav2, or of geojson and nav2 for a plan. By
-            default, geotiff and geojson, or geojson for a plan.
+        formats: Formats to write, out of geotiff, geojson, csv and nav2; a plan can be written only
+            as geojson and nav2. The default is geotiff and geojson, or geojson for a plan.
 
     Raises:
         TrustboError: A format is unknown or needs a result, or a file cannot be written.

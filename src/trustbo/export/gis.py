@@ -27,7 +27,7 @@ _BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
 def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
     """Write maps of the planning cells as the bands of a GeoTIFF in the terrain's CRS.
 
-    Bands are float32 with nodata NaN, and have the variable names as descriptions.
+    Bands are float32 with nodata NaN, and their descriptions are the variable names.
 
     Args:
         path: .tif or .tiff file to write or replace.
@@ -35,8 +35,8 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
             maps are those of the prior.
 
     Raises:
-        TrustboError: `maps` is a plan, which has no maps of all cells, or has no CRS, or the file
-            cannot be written.
+        TrustboError: `maps` is a plan, which has no maps of all cells; `maps` has no CRS; or the
+            file cannot be written.
 
     Example:
         >>> tb.export.write_geotiff("maps.tif", result.maps())
@@ -72,7 +72,7 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     """Write a path as GeoJSON (RFC 7946), in longitude and latitude (WGS 84).
 
     For a result or a campaign, this is the recommended path, the best one under the posterior mean.
-    The next path of a campaign, which may differ, is written with `campaign.ask()`.
+    To write the next path of a campaign, which may differ, pass `campaign.ask()`.
 
     The file contains a LineString of the path and a Point for each cell. The properties of a cell
     are the trust of each robot with its 90 % interval, and the failure probability. With a terrain,
@@ -81,8 +81,8 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
 
     Args:
         path: File to write or replace.
-        plan: Plan, such as `campaign.ask()` or that of `Campaign.replan` and `Follower.replan`; or
-            a result or campaign, whose recommended path is written.
+        plan: Plan, such as one from `Campaign.ask`, `Campaign.replan` or `Follower.replan`; or a
+            result or campaign, whose recommended path is written.
 
     Raises:
         TrustboError: The workspace has no CRS, or the file cannot be written.
@@ -128,8 +128,8 @@ def write_csv(path: FilePath, result: Result) -> None:
         result: Result of a campaign, or the campaign.
 
     Raises:
-        TrustboError: `result` is a plan, which has no missions, or there is no posterior yet, or
-            the file cannot be written.
+        TrustboError: `result` is a plan, which has no missions; there is no posterior yet; or the
+            file cannot be written.
 
     Example:
         >>> tb.export.write_csv("missions.csv", result)

@@ -76,7 +76,7 @@ class Frame:
     name: str = "map"
 
     def __post_init__(self) -> None:
-        # Numbers of NumPy, as from an array, become floats, because JSON knows no others.
+        # NumPy numbers, such as those from an array, become floats, because JSON knows no others.
         origin = require_position("the frame's origin", self.origin)
 
         rotation = require_finite("the frame's rotation", self.rotation)
@@ -127,8 +127,9 @@ def write_nav2(
     Before the first mission, the costs are those of the prior. The next path of a campaign may
     differ from the recommended path.
 
-    For a plan, such as `campaign.ask()`, only its waypoints and the frame are written, since a plan
-    has no costs of other bounds. A cost map and a route graph that are in the folder are kept.
+    For a plan, such as `campaign.ask()`, only its waypoints and the frame are written, because a
+    plan has no costs of other bounds. A cost map and a route graph that are already in the folder
+    are kept.
 
     Args:
         folder: Folder for `cost_map.yaml` and `.pgm`, `waypoints_<robot>.yaml` (on a terrain),
@@ -141,8 +142,9 @@ def write_nav2(
     Raises:
         TrustboError: The frame is not a `Frame` or its origin is far off the map, a robot's name
             cannot be part of a file name, a robot has no route in a bound, the grid has too many
-            cells for Nav2's ids, the map has too many pixels, or a file cannot be written. Or a
-            plan has no terrain, or the folder has files in another frame than that of the plan.
+            cells for Nav2's ids, the map has too many pixels, or a file cannot be written. The same
+            error is raised if a plan has no terrain, or if the folder has files in a frame other
+            than that of the plan.
 
     Example:
         >>> frame = tb.export.Frame(origin=(380_000.0, 5_224_800.0))
@@ -159,7 +161,8 @@ def write_nav2(
     workspace = result.workspace
     place = Frame(workspace.grid.center(plan.path[0])) if frame is None else frame
 
-    # Everything is made before the first file is written, so that no half of the files is left.
+    # All contents are made before the first file is written, so that an error leaves no incomplete
+    # set of files.
     waypoints = _waypoints(plan, place, workspace)
     files = {folder / f"waypoints_{robot}.yaml": text for robot, text in waypoints.items()}
     about = _about(place, workspace)
@@ -212,7 +215,7 @@ def _require_same_frame(file: Path, content: bytes) -> None:
 
 
 def _require_file_names(robots: Sequence[str]) -> None:
-    """Check that robots' names can be parts of file names, on Windows too, and differ there."""
+    """Check that robots' names can be parts of file names and differ, on Windows too."""
     seen = {LEAD: LEAD}
     for name in robots:
         if not re.fullmatch(r"\w([\w .-]*[\w-])?", name) or _DEVICES.fullmatch(name):
@@ -247,7 +250,8 @@ def write_ros_map(
     Args:
         path: .yaml file to write or replace.
         cost: Cost of each cell, in [0, 1], such as `Result.maps()["cost"]`; NaN if unknown. A pixel
-            has 100 times the cost, at most 98; 100 means impassable and 255 means unknown.
+            has the value 100 times the cost, at most 98; 100 means impassable and 255 means
+            unknown.
         workspace: Workspace of the cells.
         frame: Frame of the pixels. Each pixel has the cost of the cell at the pixel's centre.
         pixel: Side length of a pixel, in metres; by default a tenth of a cell's shorter side.
@@ -407,7 +411,7 @@ def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> s
 
 
 def _json(value: Any) -> str:
-    """Convert values to JSON; floats keep a decimal point, or Nav2 reads them as integers."""
+    """Convert values to JSON; floats keep a decimal point, otherwise Nav2 reads integers."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{json.dumps(k)}: {_json(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list):

@@ -10,4 +10,4 @@ __all__ = [
     "read_bag", "read_missions", "read_reports", "read_table", "read_tracks", "to_frame",
     "write_missions",
 ]  # fmt: skip
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # tab completion lists only public names

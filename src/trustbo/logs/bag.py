@@ -41,13 +41,13 @@ def read_bag(
     contact: str = "/{robot}/contact",
     prefix: str = "",
 ) -> list[Mission]:
-    """Read the missions of a ROS bag, without ticks, pauses and measured awareness.
+    """Read the missions of a ROS bag, without ticks, pauses or measured awareness.
 
     Args:
         path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2; a list of them is read as one
             bag that was split.
         workspace: Workspace whose robots are read, in the order of its team.
-        contact: Topic with the contact of each robot, whose name replaces `{robot}`.
+        contact: Topic with the contact of a robot; its name replaces `{robot}`.
         prefix: Namespace of the topics of bounds and statuses, such as `"/fleet"` for
             `/fleet/mission/bound`.
 
@@ -116,7 +116,7 @@ def _messages(
         paths: Bags.
         bounds: Topic of the bounds.
         statuses: Topic of the statuses, which may be missing.
-        contact: Topic of contact, with `{robot}`, for messages.
+        contact: Topic of contact, with `{robot}`, for error messages.
         contacts: Topics of the contact of each robot.
     """
     try:
@@ -169,7 +169,7 @@ def _require_topics(
     contact: str,
     contacts: Sequence[str],
 ) -> None:
-    """Raise TrustboError with the topics that are missing, and the argument that names others."""
+    """Raise TrustboError that lists missing topics and the argument that names other topics."""
 
     def namespace(topic: str, other: str) -> str:
         """Return what precedes a missing topic in the bag, or an example."""

@@ -36,13 +36,13 @@ _DATES = (
     "(pandas.to_datetime(t) - start).dt.total_seconds()"
 )
 _ROUNDED_DTYPE = 0.1
-"""Step of float32 at the time of a log, s, above which a column of float32 is refused."""
+"""Spacing of float32 values at the time of a log, s, above which such a column is refused."""
 _ROUNDED_VALUES = 16.0
-"""The same for a column of another type in which every value is a float32."""
+"""The same limit for a column of another type in which every value is a float32."""
 _LONGEST = 7 * 86_400.0
-"""Longest log, s: longer ones have times in milliseconds."""
+"""Longest log, s; longer logs have times in milliseconds."""
 _LATEST = 1e11
-"""Latest time of a log, s: epochs in milliseconds are later."""
+"""Latest time of a log, s; epochs in milliseconds are later."""
 
 
 class Columns:
@@ -311,7 +311,7 @@ def _of_file(file: FilePath) -> pd.DataFrame:
 
     for name in frame:
         commas = [text for text in frame[name] if "," in text]
-        if not all(map(_THOUSANDS.fullmatch, commas)):  # else `numbers` refuses them
+        if not all(map(_THOUSANDS.fullmatch, commas)):  # otherwise, `numbers` refuses them
             frame[name] = frame[name].replace(_DECIMAL_COMMA, r"\1.\2", regex=True)
 
     return frame

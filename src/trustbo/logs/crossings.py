@@ -12,7 +12,7 @@ from trustbo.logs.poses import GAP, UNITS
 from trustbo.workspace.grid import Grid
 
 _SHORT = 10.0
-"""Length of a log whose unit of time is doubted, s."""
+"""Length of a log below which its unit of time is doubted, s."""
 
 
 def crossings_of(
@@ -22,7 +22,7 @@ def crossings_of(
     grid: Grid,
     planned: Sequence[Cell] | None,
 ) -> tuple[Sequence[Cell], np.ndarray]:
-    """Return the path of the lead, by default all cells that it enters, and edges of its bounds."""
+    """Return the path of the lead (by default, all cells that it enters) and its bounds' edges."""
     located = zip(*grid.cells_at(places["x"].to_numpy(), places["y"].to_numpy()), strict=True)
     cells = [(int(row), int(col)) if is_on_grid else None for row, col, is_on_grid in located]
     visits: list[tuple[int, Cell | None]] = list(zip(places["tick"], cells, strict=True))

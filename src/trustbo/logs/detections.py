@@ -1,4 +1,4 @@
-"""Tables of poses and of detections between robots, with warnings of what is ignored in them."""
+"""Tables of poses and of detections between robots, with warnings about ignored rows."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -50,7 +50,7 @@ def read_tables(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame
 
 
 def _listed(names: Iterable[str]) -> str:
-    """Return different names as text, at most ten of them."""
+    """Return distinct names as text, at most ten of them."""
     different = [name or "blank" for name in dict.fromkeys(names)]
     return ", ".join([*different[:10], "..."] if len(different) > 10 else different)
 
@@ -58,7 +58,7 @@ def _listed(names: Iterable[str]) -> str:
 def warn_of_names(
     looks: pd.DataFrame, unknown: pd.DataFrame, leads: Sequence[str], team: Sequence[str]
 ) -> None:
-    """Warn of detections that are ignored because of their names, and of robots without any.
+    """Warn of detections that are ignored because of their names, and of robots without detections.
 
     Args:
         looks: Detections between two robots with poses.
@@ -73,7 +73,7 @@ def warn_of_names(
             "these robots; if a robot was renamed, use one name in both tables."
         )
 
-    # What is only seen may be a tree, unless it is seen where the lead is no longer seen.
+    # What is seen but has no poses may be a tree, unless it is seen only when the lead is not.
     of_lead = looks.loc[looks["lead"].isin(leads), "t"]
     apart = unknown.loc[(unknown["t"] > of_lead.max()) | (unknown["t"] < of_lead.min())]
     n_apart = apart["lead"].value_counts()
@@ -95,7 +95,7 @@ def warn_of_names(
 
 
 def warn_of_times(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) -> None:
-    """Warn of detections outside the time of poses, and of a tick that is not their interval."""
+    """Warn of detections outside the time of poses, and of a tick that is not their spacing."""
     spans = tracks.groupby("robot")["t"].agg(["min", "max"])
     of_watcher = spans.loc[looks["robot"]].to_numpy()
     of_lead = spans.loc[looks["lead"]].to_numpy()

@@ -17,7 +17,7 @@ _ARRAYS = {"awareness": "1", "contact_rate": "1", "duration": "s", "n_ticks": "1
 _SEAL = b"sha256:"
 """Beginning of the hash that follows the content of a file."""
 _SEAL_LENGTH = len(_SEAL) + 64
-"""Bytes of the hash, 64 of which are hexadecimal digits."""
+"""Length of the hash in bytes, 64 of which are hexadecimal digits."""
 
 
 def read_tree(path: FilePath, sha256: str = "") -> xr.DataTree:
@@ -102,7 +102,7 @@ def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
     """Read missions, as measured.
 
     Args:
-        path: File, folder of a campaign, or several of them, which are read in their order.
+        path: File, folder of a campaign, or a list of these, which are read in order.
 
     Raises:
         TrustboError: A file does not exist, is damaged, or contains no missions.
@@ -128,7 +128,7 @@ def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
 
 
 def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
-    """Convert missions to a tree, with ticks of bounds with poses and contacts.
+    """Convert missions to a tree, with ticks for bounds that have poses and contacts.
 
     Raises:
         TrustboError: The robots or features differ between missions.

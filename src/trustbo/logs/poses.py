@@ -9,15 +9,15 @@ UNITS = "t in seconds (days * 86400, minutes * 60, milliseconds / 1000) and x, y
 GAP = 5.0
 """Longest gap between two poses that is interpolated, s."""
 _STANDING = 1e-3
-"""Speed up to which a robot stands, so that its course is not known, m/s."""
+"""Speed up to which a robot counts as standing, so that its course is unknown, m/s."""
 _FAST = 30.0
-"""Usual speed of a robot that is warned of, m/s."""
+"""Usual speed of a robot above which a warning is issued, m/s."""
 _FASTEST = 100.0
-"""Highest speed that is read, m/s."""
+"""Highest speed that is accepted, m/s."""
 
 
 def track_of(tracks: pd.DataFrame, name: str) -> pd.DataFrame:
-    """Return the poses of one robot, sorted by time, with its heading, unwrapped."""
+    """Return the poses of one robot, sorted by time, with its unwrapped heading."""
     track = tracks.loc[tracks["robot"] == name]
     _require_order(name, track["t"].to_numpy())
 

@@ -38,10 +38,11 @@ def read_reports(
         person: Column that identifies the person.
         step: Column with the number of the step.
         report: Column with the report.
-        outcome: Column with the robot's outcome: 1, `true`, `yes` or `success`; 0, `false`, `no`
-            or `failure`; or blank. It becomes the features `success` and `failure`.
+        outcome: Column with the robot's outcome: 1, `true`, `yes` or `success`; 0, `false`, `no` or
+            `failure`; or blank. The outcome becomes the features `success` and `failure`.
         inputs: Columns of further features; standardise columns whose values are not of order 1.
-        scale: `"unit"`, reports in [0, 1]; `"likert7"` (or `"ordinal7"`), whole numbers 1 to 7.
+        scale: `"unit"` for reports in [0, 1]; `"likert7"` (or `"ordinal7"`) for whole numbers from
+            1 to 7.
 
     Returns:
         Missions, one per person in the order of the table. For a scale of levels, `n_ticks` is the

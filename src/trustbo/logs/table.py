@@ -22,7 +22,7 @@ TRUST = ("trust_mean", "trust_sd")
 _NO_FEATURES = ("x", "y", "lon", "lat", "time", "timestamp")
 _FURTHER = "every further column is a feature of awareness; drop columns that are not"
 _MIN_DECIMALS = 2
-"""Rates of fewer decimals are not rounded to the nearest tick."""
+"""Rates with fewer decimals are not rounded to the nearest tick."""
 _LAST_BITS = 1e-12
 """Differences of rates that are not due to rounded decimals."""
 
@@ -30,14 +30,14 @@ _LAST_BITS = 1e-12
 def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
     """Return a table of missions, numbered from 1, without ticks.
 
-    It has the columns of `read_table`; `to_csv(file, index=False)` writes it. Bound 0 is the start
-    cell and has no measurements. Bounds that were planned but not run are blank. A mission without
-    a map has no bound 0.
+    The table has the columns of `read_table`; `to_csv(file, index=False)` writes it to a file.
+    Bound 0 is the start cell and has no measurements. Bounds that were planned but not run are
+    blank. A mission without a map has no bound 0.
 
     Raises:
         TrustboError: The missions have different robots or features, only some of them have a path,
             a feature has the name of another column, or the name of a robot or feature would be
-            changed by a CSV file or is a formula of spreadsheets.
+            changed by a CSV file or is a formula for spreadsheets.
 
     Example:
         >>> tb.logs.to_frame(missions).to_csv("log.csv", index=False)
@@ -79,12 +79,13 @@ def read_table(table: Any) -> list[Mission]:
 
     The columns are `mission`; `bound` (0 for the start cell, which has no measurements); `robot`;
     the cell (`row`, `col`); and `contact_rate`. Optional columns are `duration` (s), `n_ticks` and
-    `status`. Other columns are features, by default `traversability` and `visibility` without any
-    value. The status of the last bound is that of the mission; an earlier bound has another status
-    than "ok" if the mission continued after it failed. A blank means "not measured", and a blank
-    status "ok". Bounds after the last one with a measurement were planned but not run. A table
-    without `row` and `col` is a log without a map. If rates have been rounded, each one is
-    read as the nearest multiple of 1 / n_ticks within half a unit of the column's last decimal.
+    `status`. Other columns are features; without such columns, the features are `traversability`
+    and `visibility`, which then count as not measured. The status of the last bound is that of the
+    mission. An earlier bound has a status other than "ok" if it failed and the mission continued. A
+    blank means "not measured", and a blank status means "ok". Bounds after the last one with a
+    measurement were planned but not run. A table without `row` and `col` is a log without a map. If
+    rates have been rounded, each one is read as the nearest multiple of 1 / n_ticks within half a
+    unit of the column's last decimal.
 
     Args:
         table: Path of a CSV file (commas, semicolons or tabs), a DataFrame, or a mapping of lists.
@@ -161,7 +162,7 @@ def _refuse_misplaced_values(
 
 
 def _to_ticks(columns: Columns, rate: np.ndarray, n_ticks: np.ndarray) -> np.ndarray:
-    """Return rates, (row,), of which rounded ones become multiples of 1 / n_ticks."""
+    """Return rates, (row,); those that were rounded become multiples of 1 / n_ticks."""
     unit = 0.1 ** max(columns.decimals("contact_rate"), _MIN_DECIMALS)
     n = np.where(n_ticks >= 1.0, n_ticks, np.nan)  # `Mission` rejects others
     nearest = np.round(rate * n) / n

@@ -36,12 +36,12 @@ def read_tracks(
 
     With a workspace, the result is one mission for `Campaign.tell`, with the robots and features of
     the workspace and without measured awareness. A bound begins where the lead enters the next cell
-    of its path. If the planned path is given, a cell is not a bound if the lead only cuts its
-    corner. If the lead does not reach the last cell, the status is `"aborted"`. The last bound ends
-    where the lead leaves its cell for more than 5 s.
+    of its path. If the planned path is given, a cell whose corner the lead only cuts does not count
+    as a bound. If the lead does not reach the last cell, the status is `"aborted"`. The last bound
+    ends where the lead leaves its cell for more than 5 s.
 
-    Without a workspace, bounds are time windows. The lead is also listed as a robot, so that all
-    missions have the same robots, with contact rates NaN and features 0. A bound without any tick
+    Without a workspace, bounds are time windows. The lead is also listed as a robot, with contact
+    rates NaN and features 0. All missions therefore have the same robots. A bound without any tick
     with known poses is not measured; its features are the means over the robot's other bounds.
     Features are averaged over a bound: `near` is r / (r + range) with the median range r of the
     log, and `ahead` is whether the lead is within 30 degrees of the heading.
@@ -50,13 +50,13 @@ def read_tracks(
         poses: Path of a CSV file, a DataFrame, or a mapping of columns: t (s), robot, x, y (m) and,
             if known, heading (rad from east, anticlockwise); by default, the heading is the
             direction of motion.
-        detections: Another such table with the columns t (on the same clock), watcher and seen.
-            Detections of objects without poses are ignored. A table without rows means that no
-            robot detected another.
+        detections: Table in any of the same forms with the columns t (on the same clock), watcher
+            and seen. Detections of objects without poses are ignored. A table without rows means
+            that no robot detected another.
         workspace: Map of the cells that the lead enters.
         path: Planned path, such as `campaign.ask().path`; it needs a workspace.
-        lead: Name of the lead. By default the robot that is not in the workspace's team; without a
-            workspace, every robot is used as the lead in turn.
+        lead: Name of the lead. By default, it is the robot that is not in the workspace's team;
+            without a workspace, every robot is used as the lead in turn.
         window: Length of a bound without a workspace, s.
         tick: Length of a tick, s.
 
@@ -162,7 +162,7 @@ def _mission(
     robots: Sequence[str],
     workspace: Workspace | None,
 ) -> Mission:
-    """Make a mission of one lead; `edges` has the first tick of each bound, then the end."""
+    """Make a mission of one lead; `edges` has the first tick of each bound, and then the end."""
     bound = np.searchsorted(edges, pairs["tick"], side="right")
     groups = pairs.assign(bound=bound).groupby(["bound", "robot"])
     means = {name: (name, "mean") for name in ("contact_rate", *_FEATURES)}
