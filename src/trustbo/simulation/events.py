@@ -63,7 +63,7 @@ class Event:
 
 @dataclass(frozen=True)
 class Jam(Event):
-    """Jammer that makes it less probable that robots in a circle detect others or are detected.
+    """Jammer that lowers the probability that robots in a circle detect others or are detected.
 
     Attributes:
         center: Centre of the circle.
@@ -235,7 +235,7 @@ class Fouling(Event):
         require_whole("seed", self.seed, 0)
 
     def change(self, world: World) -> World:
-        """See `Event.change`; for the long-run mean over missions, the factor is its mean."""
+        """See `Event.change`; the long-run mean over missions uses the mean of the factor."""
         if world.mission is None:
             return world._replace(detection=0.5 * (1.0 + self.worst) * world.detection)
 

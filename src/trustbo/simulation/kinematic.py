@@ -20,9 +20,9 @@ from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight
 
 _LEAD = slice(0, 1)
-"""The lead in arrays with the lead first."""
+"""Index of the lead in arrays with the lead first."""
 _T2 = slice(1, None)
-"""The other robots in such arrays."""
+"""Index of the other robots in such arrays."""
 
 
 class State(NamedTuple):

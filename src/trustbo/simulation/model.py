@@ -52,9 +52,10 @@ class ModelSimulator(DescribedSimulator):
                 clipped to [0, 1]; if many rates are clipped, the data do not follow the model.
             awareness: True awareness, shape (robot, move, row, col, feature), which missions
                 measure along their paths; by default the workspace's awareness.
-            n_ticks: Number of ticks of each bound, for the beta-binomial family only.
-            p_fail: Probability that a bound fails, shape (move, row, col, next_move), such as a
-                draw of `hazard.BoundRisk`, or shape (move, row, col). Failed bounds are "stuck". By
+            n_ticks: Number of ticks of each bound; used only by the beta-binomial family, which
+                needs it.
+            p_fail: Probability that a bound fails. The shape is (move, row, col, next_move), as in
+                a draw of `hazard.BoundRisk`, or (move, row, col). Failed bounds are "stuck". By
                 default, no bound fails.
 
         Raises:

@@ -72,7 +72,7 @@ def drive_together(
             failures.append((len(track), status))
 
     if failures:
-        n_ticks, status = min(failures)  # in one tick, the first status in the alphabet
+        n_ticks, status = min(failures)  # within one tick, the alphabetically first status
     else:
         n_ticks = max(len(track) for track in tracks)
         status = "ok"

@@ -44,9 +44,9 @@ class RadioSimulator(DescribedSimulator):
 
     The distance d between the centres of the cells is in units of 60 m. The cover c is the fraction
     of ground between the cells with a canopy above 1.5 m, and h is the climb in metres. The value g
-    at b is from a smooth Gaussian field, which is not on any map. The quality of the robot's radio
-    is q_i. Rates have Student t noise with 3 degrees of freedom and scale 0.06, and are clipped to
-    [0, 1]. No bound fails.
+    at b comes from a smooth Gaussian field, which is not on any map. The quality of the robot's
+    radio is q_i. Rates have Student t noise with 3 degrees of freedom and scale 0.06, and are
+    clipped to [0, 1]. No bound fails.
 
     Example:
         >>> simulator = tb.simulation.RadioSimulator(workspace, seed=0)

@@ -38,10 +38,11 @@ _ANGLES = np.linspace(0.0, 2.0 * np.pi, 13)[:-1]
 class RealtimeAwareness(DescribedSimulator):
     """Simulator whose missions contain the awareness that the robots measured in each bound.
 
-    It runs missions in a `KinematicSimulator`, and replaces traversability and visibility by the
-    first principal component of the map and of what the robots measured: speed, pitch and roll, and
-    the range and the share of clear beams of a lidar. Other features remain those of the map. A
-    campaign learns from measured awareness with `awareness="measured"`.
+    Missions are run in a `KinematicSimulator`. Traversability is replaced with the first principal
+    component of the map and of the measured speed, pitch and roll. Visibility is replaced with the
+    first principal component of the map and of a lidar's range and share of clear beams. Other
+    features remain those of the map. A campaign learns from measured awareness if it is given
+    `awareness="measured"`.
 
     Attributes:
         simulator: Simulator of the missions; use this one for `Truth.from_simulator`.

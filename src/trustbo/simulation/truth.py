@@ -72,7 +72,8 @@ class Truth(Summary):
         If the simulator has a method `expected_contact`, which returns `bounds` in closed form, no
         replicates are needed. Replicates of a `KinematicSimulator` begin where a preceding bound
         ended in the previous replicate, without detection noise if `acquire` = `drop` = 1. For any
-        other simulator, a replicate is a mission over both bounds. `Fouling` has the mean factor.
+        other simulator, a replicate is a mission over both bounds. The random factor of `Fouling`
+        is replaced by its mean.
 
         Args:
             simulator: Simulator with a `workspace`.
@@ -212,9 +213,10 @@ def _most_kept(
 ) -> tuple[Cell, ...]:
     """Find the path of at most `longest` bounds that loses the least contact.
 
-    The maximum contact kept from a bound onwards is V = max p (c + V'), with the contact c and the
-    completion probability p of the bound, and V' of the next bound. V is computed backwards for
-    each number of remaining bounds. Without `u_turns`, no bound reverses the previous bound.
+    The maximum contact kept from a bound onwards is V = max p (c + V'). Here c and p are the
+    contact and the completion probability of the bound, and V' is the value V of the next bound. V
+    is computed backwards for each number of remaining bounds. Without `u_turns`, no bound reverses
+    the previous bound.
     """
     follows = np.ones((END, END), bool)  # (move, next move)
     if not u_turns:

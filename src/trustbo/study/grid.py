@@ -31,7 +31,7 @@ from trustbo.workspace import Workspace
 _MAX_JOBS = 10**6
 """Largest number of processes that joblib may leave free (a negative `n_jobs`)."""
 _N_SHOWN = 3
-"""Number of errors of runs in the message."""
+"""Number of runs whose errors the message contains."""
 
 
 class Scene(NamedTuple):
@@ -97,7 +97,7 @@ def run_grid(
         not reached count as fully lost. `seconds` is the CPU time.
 
     Raises:
-        TrustboError: If a run failed; call the function again to repeat failed runs.
+        TrustboError: A run failed; call the function again to repeat failed runs.
 
     Example:
         >>> cases = {"default": {}, "thompson": {"policy": "thompson"}}

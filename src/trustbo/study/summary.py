@@ -36,17 +36,17 @@ _ENDS = (0.025, 0.975)
 def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     """Summarise each run in a table of `run_grid` whose scenes have a truth.
 
-    `regret after n` (%) and `lost after n` (the loss minus the best path's, in bounds) describe the
-    path recommended after n missions, in the world of the next mission. `regret now` is the mean
-    regret. `lost while learning` is the mean loss in the missions minus the loss on the best path.
-    `lost with failures` is the same if bounds that fail or are not reached count as fully lost.
-    `missions to 1 %` is the number of missions after which the regret stays within 1 %, or the
-    number of missions plus one if it never does. `arrive` is the fraction of missions that reach
-    the goal, `arrive of the first 3` and `arrive later` the same for the first three and the other
-    missions. `seconds` is the CPU time per mission.
+    `regret after n` (%) and `lost after n` (the loss minus that of the best path, in bounds)
+    describe the path recommended after n missions, in the world of the next mission. `regret now`
+    is the mean regret. `lost while learning` is the mean loss in the missions minus the loss on the
+    best path. `lost with failures` is the same if bounds that fail or are not reached count as
+    fully lost. `missions to 1 %` is the number of missions after which the regret stays within 1 %,
+    or the number of missions plus one if it never does. `arrive` is the fraction of missions that
+    reach the goal; `arrive of the first 3` and `arrive later` are the same fraction for the first
+    three missions and for the others. `seconds` is the CPU time per mission.
 
     Raises:
-        TrustboError: If no scene has a truth.
+        TrustboError: No scene has a truth.
 
     Example:
         >>> numbers = tb.study.numbers_of(table)  # of `run_grid`
@@ -101,7 +101,7 @@ def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataF
         Table with two column levels: the quantity, and its `value`, `low` and `high`.
 
     Raises:
-        TrustboError: If a column is unknown.
+        TrustboError: A column is unknown.
 
     Example:
         >>> numbers = tb.study.numbers_of(table)  # of `run_grid`
@@ -133,7 +133,7 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
         number of `pairs`. Intervals are over scenes; they are NaN if there is only one scene.
 
     Raises:
-        TrustboError: If a case or column is unknown.
+        TrustboError: A case or column is unknown.
 
     Example:
         >>> numbers = tb.study.numbers_of(table)  # of `run_grid`

@@ -36,7 +36,7 @@ _PATCH = 10.0
 _CLEARED = 0.15
 """Share of the area without its canopy in an outdated survey."""
 _CANOPY = 0.7
-"""Height of the other canopy in an outdated survey, relative to the true height."""
+"""Height of the remaining canopy in an outdated survey, relative to the true height."""
 _GROUND_ERROR = 0.3
 """Standard deviation of the ground errors of an outdated survey, m."""
 

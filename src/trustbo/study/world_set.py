@@ -61,7 +61,7 @@ def _place(ground: str) -> tuple[float, float]:
 
 
 def _reach(ground: str) -> float:
-    """Return the radius of a jammer, m, which is smaller on real terrains as they are smaller."""
+    """Return the radius of a jammer, m; it is smaller on real terrains, which are smaller."""
     return 40.0 if ground in REAL else 90.0
 
 
