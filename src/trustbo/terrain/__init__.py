@@ -18,4 +18,4 @@ __all__ = [
     "FEATURES", "PAPER_VISIBILITY", "TRAVERSABILITY", "VISIBILITY", "CompositeIndex", "example",
     "feature", "gradient", "pixel_size", "read_lidar", "read_terrain", "synthetic_terrain",
 ]  # fmt: skip
-__dir__ = __all__.copy  # completion lists public names alone
+__dir__ = __all__.copy  # tab completion lists only public names

@@ -21,9 +21,9 @@ _CONSTANT = 1e-9  # spread below which a feature, or the score, counts as consta
 class CompositeIndex:
     """First principal component of winsorised, standardised features, oriented and scaled.
 
-    Each feature is winsorised at its 1st and 99th percentiles and standardised; the first component
-    is oriented so that the loadings agree with the declared signs (sum of loading x sign > 0); the
-    2nd and 98th percentiles of its score become 0 and 1.
+    Each feature is winsorised at its 1st and 99th percentiles and standardised. The first component
+    is oriented to agree with the declared signs (sum of loading x sign > 0). The 2nd and 98th
+    percentiles of its score become 0 and 1.
 
     Attributes:
         signs: Sign of each feature: +1 if it raises the index, -1 if it lowers it.
@@ -54,7 +54,7 @@ class CompositeIndex:
             features: Values of each feature, arrays of one shape; samples with a NaN are left out.
 
         Raises:
-            TrustboError: A declared feature is missing, or no sample has all of them.
+            TrustboError: A declared feature is missing, or no sample has all features.
         """
         x = np.stack([column.ravel() for column in self._columns(features)], axis=1)
         x = x[np.isfinite(x).all(1)]
@@ -114,7 +114,7 @@ class CompositeIndex:
 
     @property
     def loadings_(self) -> xr.DataArray:
-        """Loadings (feature): unit vector with the declared orientation, 0 if constant."""
+        """Loadings (feature): unit vector with the declared orientation; 0 where constant."""
         return self.fitted["loading"]
 
     @property
@@ -125,7 +125,7 @@ class CompositeIndex:
     def transform(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> np.ndarray:
         """Compute the index of every sample, in [0, 1], with the shape of the features.
 
-        It is NaN where a feature is NaN, and 0.5 everywhere if all features were constant.
+        The index is NaN where a feature is NaN, and 0.5 everywhere if all features were constant.
 
         Raises:
             TrustboError: A declared feature is missing.

@@ -21,8 +21,9 @@ def example() -> xr.Dataset:
 
     It is a steep hillside under bush in the Wairarapa, New Zealand, near Wellington: 195 m x 278 m
     at 1 m, 211 m of relief, trees up to 44.6 m tall. The attribute `attribution` states the source
-    and the licence; `LICENCE.md` beside the files says which part of it is inferred.
-    Robots need a slope limit of about 38 degrees or more; for others, use `synthetic_terrain`.
+    and the licence; `LICENCE.md` beside the files says which part of this information is inferred.
+    Robots need a slope limit of about 38 degrees or more; for robots with lower limits, use
+    `synthetic_terrain`.
 
     Returns:
         Dataset as from `read_terrain`.
@@ -100,8 +101,8 @@ def synthetic_terrain(
 def _fractal(rng: np.random.Generator, shape: tuple[int, int], exponent: float) -> np.ndarray:
     """Draw a Gaussian field with spectrum f^-(2 exponent), scaled to [0, 1].
 
-    The field is synthesised by the Fourier method (Saupe 1988). As the method is periodic, the
-    field has twice the size and is cropped.
+    The field is synthesised by the Fourier method (Saupe 1988). Because the method is periodic, a
+    field of twice the size is drawn and then cropped.
     """
     rows = 2 * shape[0]
     cols = 2 * shape[1]

@@ -45,7 +45,7 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
     A function replaces an earlier one with the same name from the same module, so that a cell of a
     notebook can be run again.
 
-    Raises TrustboError if the name is no text or is taken by another function, or the sign is
+    Raises TrustboError if the name is not text or is taken by another function, or the sign is
     neither 1 nor -1.
 
     Example:
@@ -69,7 +69,7 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
 
 
 def _origin(function: Callable[..., Any]) -> tuple[object, ...]:
-    """Return the module and the name of a function, which stay when its definition runs again."""
+    """Return the module and name of a function, which do not change if it is defined again."""
     return tuple(getattr(function, name, None) for name in ("__module__", "__qualname__"))
 
 
@@ -99,7 +99,7 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
 
 
 def horn_gradient(dem: np.ndarray, pixel: tuple[float, ...]) -> np.ndarray:
-    """Compute the gradient of heights and pixels that were checked; see `gradient`."""
+    """Compute the gradient of heights and pixels that have been checked; see `gradient`."""
     height, width = pixel
     w = _window(dem)
     east = (w[-1, 1] - w[-1, -1]) + 2.0 * (w[0, 1] - w[0, -1]) + (w[1, 1] - w[1, -1])
@@ -152,8 +152,8 @@ def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
 def vegetation_density(terrain: xr.Dataset, crown_base: float = 0.3) -> np.ndarray:
     """Compute the fraction of the lowest 3 m above ground that canopy fills.
 
-    It is averaged over squares of half-width 5 m. The canopy is the layer from `crown_base` times
-    its height to its top.
+    The fraction is averaged over squares of half-width 5 m. The canopy is the layer from
+    `crown_base` times its height to its top.
     """
     height = canopy_height(terrain)
     filled = np.minimum(height, _LAYER) - np.minimum(crown_base * height, _LAYER)

@@ -13,13 +13,13 @@ from trustbo.errors import TrustboError, require_kind, warn
 LOWEST = -450.0
 """Lowest height on land, m: the shore of the Dead Sea is at -430 m."""
 HIGHEST = 9000.0
-"""Largest height on land, m: the summit of Everest is at 8849 m."""
+"""Highest height on land, m: the summit of Everest is at 8849 m."""
 _FILLS = (-99999.0, -32768.0, -32767.0, -9999.0)  # also suspicious before scaling
 ACCESSOR_FILL = "rio.nodata"
 """Attribute that carries the fill value of rioxarray's accessor, which most operations drop."""
 _FILL_NAMES = ("_FillValue", "missing_value", "fill_value", "nodata", ACCESSOR_FILL)
-_LOW = 10.0  # m; heights on one level with zeros
-_FAR = 100.0  # m; distance of the highest height from all others that is unlikely
+_LOW = 10.0  # m; heights up to this one are level with zeros
+_FAR = 100.0  # m; unlikely distance of the highest height from all others
 _METRE = {"m", "metre", "metres", "meter", "meters"}
 _FOOT = {"ft", "foot", "feet", "ftus", "usft"}
 _OTHER_UNIT = 0.5  # share of impossible heights from which another unit is the likely cause
@@ -37,8 +37,8 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
 
     Raises:
         TrustboError: Values are not real numbers, or are impossible as heights on land: undeclared
-            fill values, fill values blended with heights, or heights in another unit. Or the unit
-            is unknown, or the band and the CRS disagree on it.
+            fill values, fill values blended with heights, or heights in another unit. The same
+            error is raised if the unit is unknown, or if the band and the CRS disagree on it.
     """
     name = str(stored.name)
     attrs = stored.attrs
@@ -113,8 +113,8 @@ def _fills(name: str, attrs: Mapping[str, Any], nodata: float | None) -> list[fl
 def _warn_of_zeros(heights: np.ndarray, name: str) -> None:
     """Warn of pixels at exactly 0 m that are far from all other heights (missing values?).
 
-    Ground may be level, so if most pixels are zero, all others must be far away and differ: walls
-    on a floor often have one height.
+    Ground may be level. If most pixels are zero, a warning therefore requires that all others are
+    far away and differ: walls on a floor often have one height.
     """
     n_zero = int((heights == 0.0).sum())
     n_low = int((np.abs(heights) <= _LOW).sum()) - n_zero
@@ -136,7 +136,8 @@ def _warn_of_levels(heights: np.ndarray, raw: np.ndarray, name: str) -> None:
     """Warn if several pixels share the lowest or the highest height, far from all others.
 
     Arithmetic turns fill values into heights: -9999 cm are -99.99 m, and 65535 dm are 6553.5 m.
-    Roofs share a height, too, so the highest must be further away. `raw` holds the stored values.
+    Roofs also share a height, so the highest one must be further away from the others. `raw` holds
+    the stored values.
     """
     lowest = np.fmin.reduce(heights, axis=None)
     highest = np.fmax.reduce(heights, axis=None)
@@ -155,9 +156,9 @@ def _warn_of_levels(heights: np.ndarray, raw: np.ndarray, name: str) -> None:
 
 
 def _warn_of_second_scale(values: np.ndarray, scale: float, name: str) -> None:
-    """Warn of stored values that are not whole, as values that were scaled before are.
+    """Warn of stored values that are not whole numbers: they may have been scaled before.
 
-    Values are stored with a scale to save space, as whole numbers.
+    To save space, values with a scale are stored as whole numbers.
     """
     if (values != np.round(values)).mean() > 0.5:
         warn(

@@ -1,8 +1,8 @@
 """Pixels of a raster with north at the top: their size, and the pixels at given positions.
 
-The functions of positions serve arrays in NumPy and numbers in kernels, into which they are
-compiled. They also serve planning grids, whose cells are large pixels. Kernels that are cached on
-disk do not notice a change of these functions: delete `__pycache__/*.nb?` after one.
+The functions of positions accept NumPy arrays, or numbers in kernels, into which they are compiled.
+They also apply to planning grids, whose cells are large pixels. Kernels that are cached on disk do
+not notice changes to these functions: after a change, delete `__pycache__/*.nb?`.
 """
 
 from typing import Any

@@ -22,7 +22,7 @@ _STEP = 100.0  # m; distance over which a map's directions and lengths are measu
 
 @contextmanager
 def quiet_affine() -> Iterator[None]:
-    """Ignore affine's PendingDeprecationWarning of products that rioxarray computes.
+    """Ignore affine's PendingDeprecationWarning for products that rioxarray computes.
 
     Users may turn warnings into errors (`python -W error`), but cannot change these products.
     """
@@ -147,7 +147,7 @@ def converted(source: Any, target: Any, x: Any, y: Any) -> tuple[Any, Any]:
 
 
 def pixel_side(heights: xr.DataArray) -> float:
-    """Return the shorter side of a raster's pixels in metres, for degrees about."""
+    """Return the shorter side of a raster's pixels in metres; approximate for degrees."""
     side = _shorter_side(heights)
     return side * _DEGREE if heights.rio.crs.is_geographic else side
 

@@ -1,12 +1,13 @@
 """Transmittance of rays over a raster, blocked by the ground and attenuated by the canopy.
 
-Heights are given at pixel centres and bilinear between them. The canopy above the ground g is the
-layer from g + crown_base (s - g) to the surface s. A ray with m metres inside the canopy transmits
+Heights are given at pixel centres and interpolated bilinearly between them. The canopy above the
+ground g is the layer from g + crown_base (s - g) to the surface s. A ray with m metres inside the
+canopy transmits
 
     exp(-extinction m),
 
 or nothing if it hits the ground or leaves the data. Rays are followed through the squares between
-four pixel centres. Within a square, the heights along a ray are quadratic, so that m is exact. As
+four pixel centres. Within a square, the heights along a ray are quadratic, so m is exact. Because
 no point is both below the canopy and above it, the fraction of a ray inside the canopy is the
 fraction above the crown base, plus the fraction below the surface, minus 1.
 """
@@ -96,7 +97,8 @@ def _first_square(x0, dx, n):
 def transmittance(ground, surface, pixel, start, end, extinction, crown_base):
     """Compute the transmittance of a ray from `start` to `end`, each (row, col, height in m).
 
-    It is 0 if the ground blocks the ray, or if the ray leaves the raster or crosses missing data.
+    The result is 0 if the ground blocks the ray, or if the ray leaves the raster or crosses missing
+    data.
     """
     r0, c0, z0 = start
     r1, c1, z1 = end
@@ -182,9 +184,9 @@ def transmittances(ground, surface, pixel, ends, extinction, crown_base):
 def openness(ground, surface, pixel, reach, heights, canopy, coarse, first, last):
     """Compute the mean transmittance to 16 points on a circle of radius `reach` metres.
 
-    It is written to `coarse`, one value for each square of BLOCK x BLOCK pixels, for the rows of
-    squares from `first` to `last`. `heights` are those of eye and target above ground; `canopy`
-    is the extinction (1/m) and the crown base. Rays that end outside the data are ignored.
+    The result is written to `coarse`, with one value for each square of BLOCK x BLOCK pixels, for
+    the rows of squares from `first` to `last`. `heights` are those of eye and target above ground;
+    `canopy` is the extinction (1/m) and the crown base. Rays that end outside the data are ignored.
     """
     middle = 0.5 * (BLOCK - 1)
     for i in range(first, last):

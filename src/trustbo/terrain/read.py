@@ -45,9 +45,9 @@ _TILES = "to read tiles as one raster, combine them: gdalbuildvrt -srcnodata -99
 _ROUNDING = 1e-3  # of a pixel: smaller errors of a grid are rounding
 _EXACT = 1e-6  # of a pixel: smaller errors of coordinates are left as they are
 _BANDS = {"dem": {"dem", "dtm", "elevation"}, "dsm": {"dsm", "surface"}}
-"""Words by which a band of heights is known."""
+"""Names that identify a band of heights."""
 _OF_BANDS = {"scales": "scale_factor", "offsets": "add_offset", "units": "units"}
-"""Attributes with one entry for each band, and the attribute of one band."""
+"""Attributes with one entry for each band, and the corresponding attribute of one band."""
 _TALL = 60.0  # m: a higher median of the canopy height is unlikely
 _RAISED = 20.0  # m: a higher 5 % quantile of the canopy height is unlikely
 
@@ -65,8 +65,8 @@ def read_terrain(
     Both are resampled to the DEM's grid. The DEM is warped to its UTM zone (outside all zones, to a
     local transverse Mercator map) if it is in degrees, or if its map is rotated by over 22.5
     degrees or distorts lengths by over 1 %, as EPSG:3857 does. A surface below the ground is raised
-    to it. If the band or the CRS declares feet, heights are converted to metres, with a warning;
-    depths become negative heights.
+    to the ground. If the band or the CRS declares feet, heights are converted to metres, with a
+    warning; depths become negative heights.
 
     Args:
         dem: Heights: the path or address of a raster that GDAL reads (`/vsizip/...`,
@@ -141,7 +141,7 @@ def _on_one_grid(
 def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
     """Check a user's dataset of `dem` and `dsm` as `read_terrain` does, and return the result.
 
-    TrustboError: `dem` or `dsm` is missing, or `read_terrain` rejects the data.
+    Raises TrustboError if `dem` or `dsm` is missing, or if `read_terrain` rejects the data.
     """
     remedy = "give a Dataset with dem and dsm over (y, x), as from read_terrain"
     if not {"dem", "dsm"} <= {*require_kind("terrain", terrain, xr.Dataset, remedy)}:
@@ -316,7 +316,7 @@ def _band_names(array: xr.DataArray, dim: Hashable) -> list[str]:
 
 
 def _attrs_of_band(array: xr.DataArray) -> dict[Any, Any]:
-    """Return the attributes of one band of an array; rioxarray has tuples of all bands.
+    """Return the attributes of one band of an array; rioxarray stores tuples for all bands.
 
     The band is that of the coordinate `band`, which counts from 1 and remains after `sel`.
     """

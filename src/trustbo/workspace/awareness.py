@@ -190,7 +190,7 @@ def unlabelled(
 
 
 def _truth_of(what: str, values: ArrayLike) -> np.ndarray:
-    """Read a map (row, col) of truth values; raises TrustboError for other numbers than 0 and 1."""
+    """Read a map (row, col) of truth values; raises TrustboError unless all are 0 or 1."""
     flags = read_labelled(what, values, ("row", "col")).values
     if not np.isin(flags, (0.0, 1.0)).all():
         other = flags[~np.isin(flags, (0.0, 1.0))][0]

@@ -64,7 +64,7 @@ def difficulty_of(workspace: Workspace) -> Difficulty:
     (see `pursuit.largest_tilt`), divided by the tangent of `max_slope`; it is at most 2.
     `narrowness` is 1 / (1 + w / 2 m), where w is the smallest distance to an impassable pixel.
     `tightness` is log(1 + l / 1 m) / 3, where l is the length of the route beside impassable
-    pixels. All but the tilt are averaged over the next moves of a unit.
+    pixels. All measures except the tilt are averaged over the next moves of a unit.
     """
     if workspace not in _cached:
         exists = possible_next(workspace.passable_bounds.values)
@@ -123,7 +123,7 @@ def _of_bound(
 ) -> np.ndarray:
     """Compute the maximum of each measure over the robots' routes in a bound, shape (measure,).
 
-    `measured` keeps the measures of each robot's routes, many of which several next moves share.
+    `measured` keeps the measures of each robot's routes, because next moves share many of them.
     """
     robots = posts.team.lead, *posts.team.robots
 

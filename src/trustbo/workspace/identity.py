@@ -13,11 +13,11 @@ _LENGTH = 16
 
 
 def map_name(workspace: Workspace) -> str:
-    """Return a name of the map of a workspace, which is equal if the map's content is equal.
+    """Return a name for the map of a workspace; maps with equal content have equal names.
 
-    The content is the grid, the passable cells, the slope limit and the features. With a terrain,
-    these are the heights, the maps of the features and the model of sight, so that teams of
-    different size share a map. Without a terrain, it is the awareness.
+    The content consists of the grid, the passable cells, the slope limit and the names of the
+    features. With a terrain, the heights, the maps of the features and the model of sight are
+    added; teams of different size therefore share a map. Without a terrain, the awareness is added.
     """
     settings = {
         "grid": asdict(workspace.grid),

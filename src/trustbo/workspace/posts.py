@@ -131,7 +131,7 @@ class Posts:
         return linked
 
     def are_parted_by_missing(self, a: Cell, c: Cell) -> bool:
-        """Return whether only pixels without a height part the stops of two cells."""
+        """Return whether only pixels without a height separate the stops of two cells."""
         rows, cols = self.surface.ground.shape
         ends = [self.surface.nearest(*self.stop(cell)) for cell in (a, c)]
 
@@ -207,7 +207,7 @@ class Posts:
 
         If `next_cell` is None, the cell is the goal, and T2 stands around the lead.
         """
-        if (cell, next_cell) not in self._posts:  # all next cells take little more time
+        if (cell, next_cell) not in self._posts:  # all next cells take little longer
             around = [c for c in self._around(cell) if self._is_in_region(self.stop(c))]
             ahead = list(dict.fromkeys([None, *around, next_cell]))
             for c, posts in zip(ahead, self._choose_posts(cell, ahead), strict=True):
@@ -354,7 +354,8 @@ class Posts:
     def with_room(self, passable: np.ndarray) -> np.ndarray:
         """Return which of the `passable` cells (row, col) have enough passable pixels for the team.
 
-        A warning is issued if some cells have too few. Raises TrustboError if all have.
+        A warning is issued if some cells have too few. Raises TrustboError if all cells have too
+        few.
         """
         cells = [(row, col) for row, col in np.argwhere(passable).tolist()]
         cramped = [cell for cell in cells if not self._has_room(cell)]

@@ -1,7 +1,8 @@
 """Pure pursuit: the motion of a unicycle robot along a route.
 
-The simulator drives the robots by it, and the difficulty of a bound is measured along the curve
-that a robot drives by it without wheel slip, which cuts the corners of the route.
+The simulator drives the robots by pure pursuit. The difficulty of a bound is measured along the
+curve that a robot drives by pure pursuit without wheel slip. This curve cuts the corners of the
+route.
 """
 
 import math
@@ -45,7 +46,7 @@ def _squared(route, i, x, y):
 
 @_part
 def _within_a_turn(angle):
-    """Wrap an angle to [-pi, pi); the remainder is slow and computed only if needed."""
+    """Wrap an angle to [-pi, pi); the remainder is slow, so it is computed only if needed."""
     if -math.pi <= angle < math.pi:
         return angle
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

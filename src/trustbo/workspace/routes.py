@@ -23,7 +23,7 @@ Window = tuple[int, int, int, int]
 SLOWEST = 0.1
 """Speed at the slope limit as a fraction of the speed on level ground."""
 _CLEARANCE = 1.0  # preferred distance from obstacles, because robots stray from routes, m
-_TIE = 1e-9  # m on level ground; costs that differ by less are equal but for rounding
+_TIE = 1e-9  # m on level ground; costs that differ by less are equal up to rounding
 _CLOSE = 4.0  # factor on the cost of a route that is closer to an obstacle
 _compiled = kernel()
 _part = part()

@@ -54,8 +54,8 @@ class Surface(NamedTuple):
     def nearest(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Return the rows and columns of the pixels nearest to positions.
 
-        Of two pixels that are equally near, it is the one with the even index, so that rounding has
-        no direction. In kernels, it is the southern or eastern one; see `nearest_pixel`.
+        If two pixels are equally near, the one with the even index is returned, so that rounding
+        favours no direction. Kernels return the southern or eastern one; see `nearest_pixel`.
         """
         row, col = self.to_pixel(x, y)
         rows, cols = self.ground.shape
@@ -66,7 +66,7 @@ def surface_of(terrain: xr.Dataset, max_slope: float | None = None) -> Surface:
     """Make the surface of a terrain.
 
     Pixels are passable if their slope is known and at most `max_slope`, in rad; without a limit,
-    all pixels with a height are.
+    all pixels with a height are passable.
     """
     ground, canopy = (terrain[name].values.astype(float) for name in ("dem", "dsm"))
     pixel = pixel_size(terrain)

@@ -86,12 +86,12 @@ class Workspace(Summary):
     ) -> Self:
         """Make a workspace with features computed from a DEM and a DSM.
 
-        The mean of a feature over a cell applies to all robots and to all bounds into the cell.
-        A cell is impassable if more than half of its pixels are missing or steeper than the slope
-        limit. With `bounds`, a cell is also impassable if its passable pixels that are connected to
-        the rest are too few for the team, which a warning says. Openness is measured up to the
-        lidar's range, but no farther than the diagonal of a cell, because T2 does not watch the
-        lead beyond one bound.
+        The mean of a feature over a cell applies to all robots and to all bounds into the cell. A
+        cell is impassable if more than half of its pixels are missing or steeper than the slope
+        limit. With `bounds`, a cell is also impassable if it has too few passable pixels for the
+        team, not counting pixels that are cut off from the rest; a warning is then issued. Openness
+        is measured up to the lidar's range, but no farther than the diagonal of a cell, because T2
+        does not watch the lead beyond one bound.
 
         Because overwatch involves two cells, traversability is averaged along the robots' tracks in
         a bound. In addition, the feature `line_of_sight` is the predicted fraction of time in which
@@ -333,7 +333,7 @@ class Workspace(Summary):
         return cell
 
     def _why_impassable(self, cell: Cell) -> str:
-        """Return the reason why a cell is impassable for a message; empty without a terrain."""
+        """Return, for a message, the reason why a cell is impassable; empty without a terrain."""
         if self.terrain is None:
             return ""
 
