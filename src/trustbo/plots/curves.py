@@ -92,7 +92,7 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
         panel.xaxis.set_major_locator(MaxNLocator(n_ticks, integer=True))
 
     limits = np.array([panel.get_ylim() for panel in axes])
-    for panel in axes:  # as the user's axes may have scales of their own
+    for panel in axes:  # the user's axes may have scales of their own
         panel.set_ylim(limits[:, 0].min(), limits[:, 1].max())
         if panel.get_subplotspec() is not None:
             panel.label_outer()
@@ -131,16 +131,16 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
     """Plot the contact, the objective and, if given, the regret of each mission.
 
     A filled dot marks a plan that differs from the previous plan. A cross marks a mission that did
-    not reach the goal. With the objective `lost_contact`, the contact lost as measured and as
-    predicted by the plan have one axis, in bounds; predictions include the costs of failures.
+    not reach the goal. With the objective `lost_contact`, the measured and the predicted contact
+    lost share one axis, in bounds; predictions include the costs of failures.
 
     Args:
         history: History of a campaign, `Result.history`; see `Result.plot_history` for regret.
         ax: Axes to draw on, one for each variable; by default a new figure.
 
     Returns:
-        Axes, shape (variable,): contact lost (or the contact rate), the objective unless it is
-        plotted there, and regret.
+        Axes, shape (variable,): contact lost (or the contact rate), the objective unless it shares
+        the first axes, and regret.
     """
     names = [name for name in _LABELS if name in history]
     if "contact_lost" in names:

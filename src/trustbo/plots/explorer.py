@@ -92,7 +92,7 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
     require_kind("plan", plan, Plan, "give a Plan, such as Result.plan")
     require_kind("maps", maps, xr.Dataset, "give maps, such as Result.maps()")
     require_kind("history", history, xr.Dataset, "give Result.history")
-    from bokeh.embed import file_html  # imported here, as it takes half a second
+    from bokeh.embed import file_html  # imported here, because it takes half a second
     from bokeh.resources import INLINE
 
     n = history.sizes["iteration"]

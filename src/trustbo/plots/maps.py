@@ -44,7 +44,7 @@ _GROWN = 0.5
 _CONTOURS = 12
 """Maximum number of contour levels."""
 _LEVEL = 0.05
-"""Range of heights, m, up to which the ground is level and has no contour lines."""
+"""Range of heights, m, up to which the ground counts as level and has no contour lines."""
 _MAX_PIXELS = 400
 """Maximum number of rows or columns when contour lines are computed."""
 _SMOOTH = 0.01
@@ -94,7 +94,7 @@ def trust_maps(
         workspace: Workspace of the cells.
         missions: Numbers of missions, from 1; missions that were not run are skipped.
         driven: Whether each cell had been entered before each mission and after the last one, shape
-            (mission + 1, row, col). Other cells are hatched, as their trust is only predicted.
+            (mission + 1, row, col). Other cells are hatched, because their trust is only predicted.
         ax: Axes to draw on, one for each panel; by default a new figure with a legend.
 
     Returns:
@@ -334,9 +334,10 @@ def trust_bar(
     *,
     explain: bool = True,
 ) -> None:
-    """Draw a colour bar of trust, whose upper end says so if values exceed unbroken contact.
+    """Draw a colour bar of trust; an upper end of 1 is labelled "≥ 1" if values exceed 1.
 
-    Unless `explain` is false, the label of a bar in a wide figure explains this end.
+    Unless `explain` is false, the label of the bar in a wide figure explains that 1 is unbroken
+    contact.
     """
     bar = colour_bar(axes, image, label, extend=_extend(values, image.norm))
     if image.norm.vmax != 1.0:
@@ -352,7 +353,7 @@ def trust_bar(
 
 
 def _extend(values: np.ndarray, norm: Normalize) -> str:
-    """Return at which ends of a colour scale there are values beyond it."""
+    """Return the ends of a colour scale beyond which there are values."""
     found = values[np.isfinite(values)]
     below = bool((found < norm.vmin).any()) if norm.vmin is not None else False
     above = bool((found > norm.vmax).any()) if norm.vmax is not None else False
@@ -484,7 +485,7 @@ def trust_limits(values: np.ndarray) -> tuple[float, float]:
 
 
 def up_to_contact(low: float, high: float) -> tuple[float, float]:
-    """Lower the upper end of a scale of trust to 1 if it is just above; see `trust_limits`."""
+    """Lower the upper end of a scale of trust to 1 if it is just above 1; see `trust_limits`."""
     if low < 1.0 < high < _LOGIT:
         high = 1.0
     return low, high
@@ -497,7 +498,7 @@ def draw_scale(ax: Axes, grid: Grid) -> None:
     longest = _LONGEST_BAR * width
     magnitude = 10.0 ** np.floor(np.log10(longest))
     lengths = (factor * magnitude for factor in (1, 2, 5))
-    length = max(length for length in lengths if length <= longest * (1 + 1e-9))  # or its rounding
+    length = max(length for length in lengths if length <= longest * (1 + 1e-9))  # up to rounding
     ends = [_BAR_END - length / width, _BAR_END]
 
     (bar,) = ax.plot(ends, [0.045, 0.045], color=ink(), linewidth=2.0, transform=ax.transAxes)

@@ -50,7 +50,8 @@ def drawing(style: Any) -> Iterator[None]:
     """Draw with a Matplotlib style, and restore the user's settings afterwards.
 
     Matplotlib loads its backend with the first figure. In notebooks, the backend then turns on a
-    setting for displaying figures. Load the backend first, so that restoring keeps this setting.
+    setting for displaying figures. The backend is therefore loaded first, so that restoring keeps
+    this setting.
     """
     plt.draw_if_interactive()
     with plt.style.context(style):
@@ -110,7 +111,7 @@ def figure_of(axes: Sequence[Axes] | np.ndarray) -> Figure:
 def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
     """Add a legend below the axes or, without a constrained layout, inside the first axes.
 
-    Without a constrained layout, narrow axes have no legend, which would hide the data.
+    Without a constrained layout, narrow axes get no legend, because it would hide the data.
     """
     figure = figure_of(axes)
     if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
