@@ -410,8 +410,9 @@ class Planner(Summary):
         For the first two objectives, `nx.shortest_path(graph, start, goal, weight="cost")` then has
         the value of the plan, unless it has more than `max_bounds` bounds, or there is a risk. If
         beta0 is not 0, it is a heuristic, because trust after a bound depends on the bounds before.
-        `planning.reference` plans with networkx in all cases. The costs for your own objectives are
-        those of `terminal` if trust counts at the goal only, and otherwise those of `mean`.
+        `planning.reference` plans in these cases, too, with networkx on the unrolled graph or by
+        enumeration. The costs for your own objectives are those of `terminal` if trust counts at
+        the goal only, and otherwise those of `mean`.
 
         Costs are at least 0, as the algorithm of Dijkstra requires, unless a bound cost is
         negative. Then use `nx.bellman_ford_path`, if no loop has a negative cost.
