@@ -1,16 +1,17 @@
-"""Does measured awareness improve the prediction of the next mission? Prints a Markdown table.
+"""Test whether measured awareness improves predictions of the next mission; print a table.
 
     python benchmarks/awareness.py --out out/awareness
     python benchmarks/awareness.py --data DIR -n 30
 
 In each world, eight missions on random paths are simulated once, with the awareness that the robots
-measured (`simulation.RealtimeAwareness`). After some of them, the model is fitted twice: to the
-awareness of the map, and to the measured awareness. Both posteriors predict the next mission from
-the map, because nothing has been measured ahead. The third row predicts it from the awareness that
-will be measured, which no planner can do. Worlds differ in their terrain and in what is wrong with
-the map; the last one is the terrain of the paper, with several sets of missions. Each world is a
-pair, and intervals are those of the t-distribution over worlds. With --data, the worlds are those
-on the real terrains in this folder. Results in --out are reused.
+measured (`simulation.RealtimeAwareness`). After some of these missions, the model is fitted twice:
+to the awareness of the map and to the measured awareness. Both posteriors predict the next mission
+from the map, because nothing has been measured in that mission yet. In the third row, the next
+mission is predicted from the awareness that will be measured in it, which is not available to a
+planner. Worlds differ in their terrain and in what is wrong with the map. The last world is the
+terrain of the paper, with several sets of missions. Differences are paired by world, and their
+intervals are based on the t-distribution over worlds. With --data, the script uses the worlds on
+the real terrains in this folder. Results in --out are reused.
 """
 
 import warnings

@@ -1,17 +1,18 @@
-"""Differences in LOO between one model fitted as a class, a function and an own NumPyro MCMC.
+"""Compare LOO of one model that is fitted as a class, as a function and by NumPyro's own MCMC.
 
     python benchmarks/compare.py ["fit, NUTS"] [own] ... [-n 6 20] [--seeds 1]
 
 The missions are driven by the kinematic simulator on the example hillside, and all their rates have
-`n_ticks`. The model is `PooledTrust()`, written down again as a NumPyro function for the two other
-ways. The true difference is 0 nats, except for the noise of half a tick that `fit` adds to
-`delta_v`; the target is less than 3 nats. Each row shows the `elpd` of a posterior, its difference
-to that of `tb.fit` by importance sampling with its standard error over missions, the standard
-deviation of the difference over seeds, the largest k-hat, and how many missions were left out by
-refits.
+`n_ticks`. The model is `PooledTrust()`. For the function and for NumPyro's MCMC, the same model is
+written as a NumPyro function. The true difference is 0 nats, except for the noise of half a tick
+that `fit` adds to `delta_v`; the target is a difference of less than 3 nats. Each row shows the
+`elpd` of a posterior and its difference from the `elpd` of `tb.fit` with importance sampling. It
+also shows the standard error of the difference over missions, its standard deviation over seeds,
+the largest k-hat, and the number of missions that were left out by refits.
 
-`own, az.compare` is an own MCMC in `arviz.compare`, which has no refits. `own, densities` is the
-same without `n_ticks`, as version 0.4 compared it; `tb.compare` refuses it.
+`own, az.compare` passes NumPyro's own MCMC to `arviz.compare`, which does not refit.
+`own, densities` does the same without `n_ticks`, as version 0.4 did; `tb.compare` refuses this
+comparison.
 """
 
 import warnings

@@ -2,10 +2,11 @@
 
     python benchmarks/earlier.py --data DIR --out out/earlier
 
-In each world, an earlier campaign of 6 missions runs from south-west to north-east. A new campaign
-of 5 missions runs from north-west to south-east: without earlier missions, after the earlier
-campaign on the same terrain, and after one on another terrain whose deviation from the assumed
-world is of the same kind. The contact lost in the new campaign is compared in pairs.
+In each world, an earlier campaign runs 6 missions from south-west to north-east. A new campaign
+runs 5 missions from north-west to south-east, under three conditions: without earlier missions,
+after the earlier campaign on the same terrain, and after an earlier campaign on another terrain
+whose deviation from the assumed world is of the same kind. The script compares the contact lost in
+the new campaigns in pairs.
 
 Results in --out are reused. `--variant` adds variants of the conditions.
 """

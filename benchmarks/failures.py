@@ -12,7 +12,8 @@ compares their predicted arrival probability with the fraction of simulated runs
 script can be resumed. --jobs sets the number of processes.
 
 The part `separation` simulates all bounds with all next moves in the worlds whose slope limit is 2
-degrees too high, and prints how well several measures of tilt separate those that fail.
+degrees too high, and prints how well several measures of tilt separate the bounds that fail from
+the others.
 
 The part `price` prints the failure probability of plans on wellington, computed from the product of
 means, from components, and from all draws.

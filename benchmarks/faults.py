@@ -7,9 +7,9 @@ that also fails without the fault is ignored. If the text to replace is no longe
 fault cannot be inserted and counts as not detected. Whoever changes such code should adapt the
 fault to the new code.
 
-The text is searched in the file of the fault and, as code may have moved, in the whole source.
-Cached kernels would not notice a change in the kernels that they call. Therefore, a fault in a file
-with kernels is tested with an empty cache.
+The script searches for the text in the file of the fault and, because code may have moved, in the
+whole source. Cached kernels would not notice a change in the kernels that they call. Therefore, a
+fault in a file with kernels is tested with an empty cache.
 """
 
 import os

@@ -1,12 +1,13 @@
-"""What a campaign says before and after a few missions, beside the truth of simulated worlds.
+"""Compare what a campaign says before and after a few missions with the truth of worlds.
 
     python benchmarks/first_plan.py [band] [regret] [--data DIR] [--set] [--out DIR]
 
 - band: coverage of the 90 % band of the first plan's value, before any mission, by kind of world.
-- regret: coverage of `tb.RegretBound(eps=0.05, delta=0.1)`: in campaigns of 15 missions, how often
-  the rule stops, and how often the true regret of the recommended path is then at most 5 %.
+- regret: coverage of `tb.RegretBound(eps=0.05, delta=0.1)` in campaigns of 15 missions. The table
+  shows how often the rule stops a campaign, and how often the true regret of the recommended path
+  is then at most 5 %.
 
-Worlds and courses are those of `benchmarks/worlds.py`; truths and campaigns are kept in --out.
+Worlds and courses are those of `benchmarks/worlds.py`. Truths and campaigns are kept in --out.
 """
 
 from functools import partial

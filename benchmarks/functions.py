@@ -2,12 +2,13 @@
 
     python benchmarks/functions.py [campaign] [program] [sbc] [--seeds N] [--sets N]
 
-- campaign: a campaign of eight missions with a saturating drift, beside NumPyro's own MCMC (NUTS, 4
-  vectorised chains of 500 + 1000 draws, its default settings) on the same data after each mission,
-  compiled anew each time, as a script would, and once on all eight missions. CPU seconds with
-  compilation, effective draws per second, and diagnostics of both.
-- program: `PooledTrust().program` passed as a function, beside `sampler="nuts"` of the class.
-- sbc: simulation-based calibration of the saturating model through `tb.fit`.
+- campaign: run a campaign of eight missions with a saturating drift. Then run NumPyro's own MCMC
+  (NUTS, 4 vectorised chains of 500 + 1000 draws, otherwise with default settings) on the same data:
+  after each mission, with a new compilation each time, as a script would, and once on all eight
+  missions. Print the CPU time with compilation and the diagnostics of both.
+- program: compare `PooledTrust().program`, passed as a function, with `sampler="nuts"` of the
+  class.
+- sbc: check the saturating model, fitted by `tb.fit`, by simulation-based calibration.
 """
 
 import time

@@ -16,8 +16,9 @@ The first rows of the table are arguments that are numbers, names, arrays, lists
 of value. A user may plausibly pass these values, except for objects of other classes. The last rows
 are arguments that are flags, files, or objects such as a workspace: None is plausible there, but a
 wrong class may get Python's own error. Below the table, each TypeError, foreign exception and hang
-of a plausible value is listed, with the argument, the values and the line of the source; --all
-lists the others, too. The exit status is 1 if there is a foreign exception or a hang in the list.
+of a plausible value is listed, with the argument, the values and the line of the source. With
+--all, the others are listed, too. The exit status is 1 if there is a foreign exception or a hang in
+the list.
 
 Everything is deterministic. Names select the calls whose name begins with one of them.
 """

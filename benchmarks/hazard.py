@@ -4,9 +4,9 @@
 
 In each simulated data set, 15 missions cross 10 of 80 bounds. In every third mission, the place of
 a failure is unknown. In half of the data sets, the true slope limit is 4 degrees below the stated
-limit. The script compares the default prior of the margin with a single wide normal
-distribution. For each prior, it prints how many posterior means are off by more than .2 prior sds
-at an accepted k-hat, and how many posteriors are rejected.
+limit. The script compares the default prior of the margin with a single wide normal distribution.
+For each prior, it prints how many posterior means are off by more than .2 prior sds although k-hat
+is accepted, and how many posteriors are rejected.
 """
 
 import argparse

@@ -2,23 +2,24 @@
 
     python benchmarks/inference.py [fits] [nuts] [paper] [memory] [busy] [filter]
 
-`fits`: CPU time of fits of the default model to 3, 15, 60 and 200 missions, with shared noise and
-with censored rates. `later` is a fit that starts from the posterior of one mission fewer, as in a
-campaign. The first fit of the process, of 3 missions, has its own row.
+`fits`: CPU time of fits of the default model to 3, 15, 60 and 200 missions, and of fits with shared
+noise and with censored rates. A `later` fit starts from the posterior of the fit to one mission
+fewer, as in a campaign. The first fit of the process, to 3 missions, has its own row.
 `nuts`: CPU time of `sampler="nuts"` for the default model and eight missions, with compilation, and
-the difference of the means to importance sampling.
+the difference of the means from those of importance sampling.
 `accuracy`: errors of the posterior means of fits with 10 x --seeds seeds, in posterior standard
-deviations, compared with a run of over 20 000 points, for 3, 8 and 15 missions of `trustbo demo`.
-`paper`: effective draws and CPU seconds for the paper's model and 600 rates, compared with
-`MCMC(NUTS(model.program))`, with the same program with latent trust sampled, with the likelihood of
-dynamax and with PyMC and nutpie. All samplers run with the same seeds, one sampler after another,
-and have run once before. The effective size is the smaller one of beta0 and delta_w. There are two
-data sets: rates of `missions`, which have no memory, so that they tell delta_w^2 + delta_v^2 but
-hardly either of the two, and rates simulated from the model with beta0 = 0.6. All peers take some
-30 minutes of CPU time; set NPROC=1 for JAX in one thread.
+deviations. The means are compared with those of a run with over 20 000 points, for 3, 8 and 15
+missions of `trustbo demo`.
+`paper`: effective draws and CPU seconds for the paper's model and 600 rates. The peers are
+`MCMC(NUTS(model.program))`, the same program with latent trust sampled, the likelihood of dynamax,
+and PyMC with nutpie. All samplers use the same seeds, run one after another, and have run once
+before. The effective size is the smaller of the sizes for beta0 and delta_w. There are two data
+sets. The rates of `missions` have no memory, so they determine delta_w^2 + delta_v^2 but say little
+about delta_w and delta_v separately. The other rates are simulated from the model with beta0 = 0.6.
+All peers together take some 30 minutes of CPU time; set NPROC=1 to run JAX in one thread.
 `memory`: bytes of a posterior of 60 missions, with all groups and with the parameters alone.
-`busy`: wall time of a fit of 60 missions with all groups, alone and beside two processes that
-always compute. Two cores shared fairly by three processes give a ratio of 1.5.
+`busy`: wall time of a fit to 60 missions with all groups, alone and beside two processes that
+always compute. If three processes share two cores fairly, the ratio is 1.5.
 `filter`: time to update the filter with one bound of three robots, with 1000 draws.
 
 The peers are installed by `pip install trustbo[bench]`; a peer that is missing is left out.

@@ -1,4 +1,4 @@
-"""Time per mission without the fit, memory and disk space, early and late in a campaign.
+"""Time per mission (without the fit), memory and disk space, early and late in a campaign.
 
 python benchmarks/long_campaign.py [--missions 150]
 """

@@ -2,13 +2,14 @@
 
     python benchmarks/nuts.py [3] [8] [15] [--seeds 10]
 
-A greedy campaign of the default model, as `trustbo demo` runs it, gives the missions. For each
+The missions are those of a greedy campaign with the default model, as in `trustbo demo`. For each
 number of missions, the default model is fitted by NUTS with all seeds in one process. The table
-shows the fits that the diagnostics of `fit` refuse; the worst R-hat, the least ESS and the number
-of divergences of all fits; the CPU time of the first fit, which compiles, and the median of later
-fits; and the CPU time per effective draw. The last column is the largest difference between the
-posterior means of all chains and those of importance sampling with eight times as many points as
-usual, in units of its Monte Carlo standard error.
+shows the number of fits that the diagnostics of `fit` refuse, and the worst R-hat, the smallest ESS
+and the number of divergences over all fits. It also shows the CPU time of the first fit, which
+includes compilation, the median CPU time of later fits, and the CPU time per effective draw. The
+last column is the largest difference between the posterior means over all fits and those of
+importance sampling with eight times as many points as usual, in units of its Monte Carlo standard
+error.
 """
 
 import sys

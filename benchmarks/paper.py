@@ -6,13 +6,13 @@
 
 The paper claims that Bayesian optimisation needs fewer explorations of the workspace and learns the
 trust model more efficiently. `worlds` runs campaigns with the settings of `tb.paper` (but with
-importance sampling) on simulated worlds. The paths of `greedy` are the best under the posterior
-mean, for the cost (6) or for the mean trust; those of `random` do not depend on what was learned;
-`prior only` repeats the first path, which is the best under a draw of the prior. Each campaign
-writes a file to --out, and is skipped if its file exists.
+importance sampling) on simulated worlds. The paths of `greedy` are the best ones under the
+posterior mean, for the cost (6) or for the mean trust. The paths of `random` do not depend on what
+was learned. `prior only` repeats the first path, which is the best one under a draw of the prior.
+Each campaign writes a file to --out and is skipped if its file exists.
 
-`priors` prints the share of prior-predictive contact rates in [0, 1], and `seconds` the CPU time of
-the campaign of eight missions of the paper, with NUTS.
+`priors` prints the fraction of prior-predictive contact rates in [0, 1]. `seconds` prints the CPU
+time of the paper's campaign of eight missions with NUTS.
 """
 
 import time

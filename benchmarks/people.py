@@ -1,4 +1,4 @@
-"""Predictions of HumanTrust for people left out of the fit, in two studies, against baselines.
+"""Compare predictions of HumanTrust and baselines for people left out of the fit in two studies.
 
     python benchmarks/people.py [soh] [azevedo] [--data FOLDER]
 

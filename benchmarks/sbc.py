@@ -5,8 +5,9 @@
 Data sets are simulated from the prior, and each true parameter is ranked among posterior draws
 (Talts et al. 2018). If prior, likelihood and sampler are consistent, the ranks are uniform. Each
 row of the table is a model. Its missions are random walks on a small grid, with missing rates. The
-ranks of each parameter are tested for uniformity. A row counts the parameters that are rejected at
-1 % after Holm's correction for all tests. To check your own model, add a row to `ROWS`.
+ranks of each parameter are tested for uniformity. A row shows the number of parameters for which
+uniformity is rejected at the 1 % level, after Holm's correction for all tests. To check your own
+model, add a row to `ROWS`.
 """
 
 import argparse

@@ -1,12 +1,13 @@
-"""Error of predicted contact in bounds that were not driven; prints a table of docs/benchmarks.md.
+"""Print the error of predicted contact in bounds that no robot has driven (docs/benchmarks.md).
 
     python benchmarks/undriven.py --data DIR --out out/undriven
 
 In each world and on two courses, the default campaign runs six missions. The contact of the team in
-all other bounds is then predicted by the prior, which knows the map only, and by two models fitted
-to these missions: the default model, and the same without effects of robots in bounds. The error of
-a bound is the absolute difference from the true expected contact rate. Its mean over bounds is
-averaged over courses, and the interval is a bootstrap over worlds of the paired difference.
+all other bounds is then predicted by the prior, which only knows the map, and by two models fitted
+to these missions: the default model, and the default model without effects of robots in bounds. The
+error in a bound is the absolute difference from the true expected contact rate. The mean error over
+bounds is averaged over courses. The interval of the paired difference is computed by a bootstrap
+over worlds.
 """
 
 from typing import Any

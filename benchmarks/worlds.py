@@ -8,7 +8,7 @@ The following smaller set of 17 worlds and 2 courses is used to evaluate changes
     python benchmarks/worlds.py --set --out out/set --csv set.csv
 
 By default, the benchmark runs all worlds, 4 courses and all methods, with 15 missions each. If you
-call it again, also with other options, existing results in --out are reused. The tables contain the
+run it again, even with other options, existing results in --out are reused. The tables contain the
 selected results. `--csv` writes a row for each world, course and method.
 """
 
