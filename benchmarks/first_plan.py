@@ -7,7 +7,7 @@
   shows how often the rule stops a campaign, and how often the true regret of the recommended path
   is then at most 5 %.
 
-Worlds and courses are those of `benchmarks/worlds.py`. Truths and campaigns are kept in --out.
+Worlds and courses are those of `benchmarks/worlds.py`. Truths are kept in --out.
 """
 
 from functools import partial

@@ -1,6 +1,7 @@
-"""Baselines of the benchmark, as their advocates would run them: one file each, and `paths`.
+"""Baselines of the benchmark, with the settings that their authors recommend, one per file.
 
-A baseline is a policy that learns by itself. Its factory takes no arguments, or the `truth`; the
-policy has `learn(campaign, mission)` and `recommend(campaign)`, see docs/worlds.md. All have the
-campaign's line of sight and admissible paths, and choose among these as they like.
+A baseline is a policy that learns from missions without a trust model. Its factory takes no
+arguments, or the `truth`. The policy has the methods `learn(campaign, mission)` and
+`recommend(campaign)`; see docs/worlds.md. All baselines use the line of sight and the admissible
+paths of the campaign.
 """

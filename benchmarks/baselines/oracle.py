@@ -1,8 +1,8 @@
-"""Oracle: given every change, it drives the best path of each mission's world.
+"""Oracle that knows all changes of the world and drives the best path in each mission.
 
-It has the truth that regret is held against, as no method can. Its advocate is the referee: a
-regret that is not 0 shows a fault of the benchmark, and its loss is what chance alone costs.
-Less than 0.01 s a mission, once the truth is there.
+It plans with the truth that is used to compute the regret. Its regret must therefore be 0;
+otherwise, the benchmark has a fault. Its loss is due to chance alone. A mission takes less than
+0.01 s after the truth has been computed.
 """
 
 from trustbo.campaign.campaign import Campaign

@@ -1,7 +1,8 @@
-"""Shared by the baselines: line of sight of bounds, and best paths on a table of rates.
+"""Functions that the baselines share: line of sight of bounds, and best paths for given rates.
 
-Rates of bounds are tables (..., move, row, col) of the eight `MOVES`: the expected contact rate of
-the bound that enters a cell by a move, mean over robots; NaN where there is no bound.
+Rates of bounds are arrays with the axes (..., move, row, col) for the eight `MOVES`. They contain
+the expected contact rate, averaged over robots, of the bound that enters a cell by a move, and NaN
+if there is no such bound.
 """
 
 from collections.abc import Sequence

@@ -1,11 +1,11 @@
-"""Gaussian process over bounds of the error of line of sight, without a state space.
+"""Gaussian process over bounds for the error of line of sight, without a state space.
 
-It has line of sight and the rates of the bounds that were driven, and that errors are alike where
-bounds are near and point the same way: the map is wrong in places. Its advocates would run it as
-geostatisticians do, as regression kriging: a squared exponential kernel over the middle and the
-direction of a bound, all hyperparameters at the maximum of the exact marginal likelihood after each
-mission; then the best path under the upper 90 % quantiles of all bounds. Trust, in it, has no
-memory. 0.15 s a mission.
+This baseline uses line of sight and the rates of the bounds that missions have driven. It assumes
+that the errors of line of sight are similar in bounds that are close to each other and have similar
+directions. The method is regression kriging, as in geostatistics. The squared exponential kernel
+depends on the middle and the direction of a bound, and all hyperparameters maximise the exact
+marginal likelihood after each mission. The planned path is the best one under the upper 90 %
+quantiles of all bounds. Trust has no memory. A mission takes 0.15 s.
 """
 
 import warnings

@@ -1,7 +1,4 @@
-"""Paths that nothing is learned for: a random one, and a random one of those with fewest bounds.
-
-Their advocates would say that variety costs little where all paths are alike. No time at all.
-"""
+"""Baselines that do not learn: a random path, and a random path with the fewest bounds."""
 
 import numpy as np
 

@@ -1,6 +1,6 @@
-"""Other tools on our trust models, for `inference.py`; each module needs the tool it is named for.
+"""Samplers of other libraries for our trust models; each module needs the library in its name.
 
-The function `samplers` of a module makes samplers by name, for some data. A sampler takes a seed.
-It returns draws of the parameters by name, with leading axes (chain, draw), and the number of
-divergences. It is compiled, and has run once.
+The function `samplers` of a module returns samplers for given data, keyed by name. A sampler takes
+a seed. It returns the draws of each parameter, with the leading axes (chain, draw), and the number
+of divergences. It has been compiled and has run once.
 """

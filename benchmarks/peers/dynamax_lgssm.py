@@ -1,7 +1,8 @@
 """The pooled model with the likelihood of dynamax's linear Gaussian state-space model.
 
-dynamax has no sampler of its own for constrained parameters; NumPyro's NUTS samples them. State and
-rate are scalars, one sequence for each mission and robot; all sequences are filtered side by side.
+dynamax has no sampler for constrained parameters, so NumPyro's NUTS samples them. State and rate
+are scalars. There is one sequence for each mission and robot, and all sequences are filtered in
+parallel.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
-"""Best plans without the planner: every admissible walk written out, bound by bound.
+"""Best plans without the planner, found by enumerating every admissible walk.
 
-It shares no code with `trustbo.planning`. A `World` holds a problem as plain arrays over the eight
-moves (n, ... row by row) into each cell; walks of one length are extended all at once.
+This module shares no code with `trustbo.planning`. A `World` contains a problem as plain arrays
+over the eight moves into each cell. All walks of the same length are extended at once.
 """
 
 from itertools import pairwise

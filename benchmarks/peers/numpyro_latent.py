@@ -1,4 +1,4 @@
-"""The pooled model as equations (3)-(4) are printed: NumPyro's NUTS samples latent trust too."""
+"""The pooled model as printed in equations (3)-(4), with latent trust sampled by NumPyro's NUTS."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""NumPyro's NUTS on a program, of ours or of other peers; trust is integrated out by ours."""
+"""NumPyro's NUTS for the program of a model, in which trust is integrated out."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

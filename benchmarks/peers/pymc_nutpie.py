@@ -1,7 +1,7 @@
-"""The pooled model in PyMC, trust integrated out by a Kalman filter in PyTensor; nutpie samples it.
+"""The pooled model in PyMC, with trust integrated out by a Kalman filter in PyTensor, for nutpie.
 
-The filter is unrolled over bounds, all sequences side by side, with one variance for all, since no
-rate is missing.
+The filter is unrolled over bounds and processes all sequences in parallel. All sequences have the
+same variance, because no rate is missing.
 """
 
 from collections.abc import Callable

@@ -67,7 +67,7 @@ class Effect:
     names: ClassVar[tuple[str, ...]] = ()
     """Names of the hyperparameters."""
     group: ClassVar[str] = ""
-    """Plural group for what has the effect; also the name of the group in a posterior."""
+    """Plural noun for what has the effect; also the name of the group in a posterior."""
     variables: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Axes of each variable of the effect by name, after (chain, draw)."""
     coords: ClassVar[Mapping[str, Sequence[Any]]] = {}
