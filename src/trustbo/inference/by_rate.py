@@ -1,13 +1,13 @@
-"""Single contact rates as observations, for ArviZ's functions of single observations.
+"""Single contact rates as observations, for ArviZ functions that need single observations.
 
 The rates of a mission depend on each other, so the likelihood of a mission is not a product over
 rates. It is a product of predictions one step ahead (Buerkner, Gabry and Vehtari 2020),
 
     p(y_1, ..., y_n | theta) = prod_k p(y_k | y_1, ..., y_k-1, theta),
 
-where the rates of a mission are in the order of bounds and then robots. `by_rate` returns these
-factors as log-likelihoods, and draws from the same distributions as predictions. So each rate is
-predicted from the earlier rates of its mission, and PIT values are uniform if the model is right.
+where the rates of a mission are ordered by bound and then by robot. `by_rate` returns these factors
+as log-likelihoods, and draws from the same distributions as predictions. Each rate is thus
+predicted from the earlier rates of its mission, and PIT values are uniform if the model is correct.
 """
 
 from collections.abc import Iterator
@@ -31,14 +31,14 @@ from trustbo.statespace.blocks import Layout, LinearPredictor, each
 from trustbo.streams import stream
 
 _NUMBERS = 2_000_000
-"""Most log-likelihoods that are returned; from this number, fewer draws are."""
+"""Largest number of log-likelihoods that are returned; beyond it, fewer draws are returned."""
 _FEWEST_DRAWS = 200
-"""Draws that are returned for any number of rates."""
+"""Smallest number of draws that are returned, whatever the number of rates."""
 _OF_RATES = ("mission", "bound", "robot")
 _PER_DRAW = ("posterior", "sample_stats", "log_prior")
-"""Groups of which the chosen draws are copied."""
+"""Groups from which the chosen draws are copied."""
 _COPIED = ("prior",)
-"""Groups that are copied as they are."""
+"""Groups that are copied unchanged."""
 
 
 class Predictors(NamedTuple):
@@ -50,12 +50,12 @@ class Predictors(NamedTuple):
 
 
 class _Source(NamedTuple):
-    """What the rates of a posterior are predicted with."""
+    """Everything that is needed to predict the rates of a posterior."""
 
     observations: Observations
     layout: Layout
     likelihood: Family
-    predictors: Iterator[Predictors]  # of chunks of draws
+    predictors: Iterator[Predictors]  # one item per chunk of draws
     of_counts: bool  # whether log-likelihoods are of tick counts if every rate has one
 
 
@@ -64,11 +64,12 @@ def by_rate(posterior: xr.DataTree, *, model: Model | None = None) -> xr.DataTre
     """Return a posterior in which each contact rate is an observation, for ArviZ.
 
     Functions such as `az.plot_loo_pit`, `az.loo_pit` and `az.metrics` need a log-likelihood and
-    predictions of single observations. Here, a rate is predicted one step ahead, from the earlier
-    rates of its mission. The log-likelihoods sum to those of missions: exactly for Gaussian rates,
-    and up to the error of moment matching (see `TrustFilter`) for other families. `az.loo` of the
-    result leaves out one such factor at a time; to leave out missions, use `loo` or `compare` of
-    the posterior itself.
+    predictions of single observations. Here, each rate is predicted one step ahead, from the
+    earlier rates of its mission. The log-likelihoods of the rates of a mission add up to that of
+    the mission. For Gaussian rates, the sum is exact; for other families, it has the error of
+    moment matching (see `TrustFilter`). `az.loo` of the result leaves out one of these one-step
+    predictions at a time; to leave out whole missions, call `loo` or `compare` with the posterior
+    itself.
 
     Args:
         posterior: DataTree from `fit` that includes the data.
@@ -76,12 +77,13 @@ def by_rate(posterior: xr.DataTree, *, model: Model | None = None) -> xr.DataTre
             function that was not used before in this process.
 
     Returns:
-        DataTree with the groups `log_likelihood`, `posterior_predictive`, `prior_predictive` (if
-        the posterior has it, for whole missions) and `observed_data`, each with contact_rate[...,
-        rate] for the measured rates; `constant_data` with each feature[rate]; the same draws of
-        `posterior`, `sample_stats` and `log_prior`; and `prior`. `mission`, `bound` and `robot` are
-        coordinates of the axis `rate`. If there are over 2 million log-likelihoods, fewer draws are
-        returned, evenly spaced, but at least 200.
+        DataTree with one entry per measured rate on the axis `rate`, whose coordinates are
+        `mission`, `bound` and `robot`. The groups `log_likelihood`, `posterior_predictive`,
+        `prior_predictive` (for whole missions, if the posterior has it) and `observed_data` contain
+        contact_rate[..., rate]. `constant_data` contains each feature[rate]. `posterior`,
+        `sample_stats` and `log_prior` contain the same draws, and `prior` is copied. If there would
+        be more than 2 million log-likelihoods, fewer draws are returned, evenly spaced, but at
+        least 200.
 
     Raises:
         TrustboError: If the posterior is not from `fit` or contains no data.
@@ -136,7 +138,7 @@ def by_rate(posterior: xr.DataTree, *, model: Model | None = None) -> xr.DataTre
 
 
 def _has_data(posterior: xr.DataTree) -> bool:
-    """Return whether a posterior contains its data; if not, `missions_of` says what to do."""
+    """Return whether a posterior contains its data; if not, `missions_of` explains what to do."""
     return "observed_data" in posterior.children
 
 

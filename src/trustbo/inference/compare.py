@@ -15,13 +15,13 @@ from trustbo.inference.loo import LeftOut, estimated, left_out
 from trustbo.parallel import computing
 
 _LEAST_DIFFERENCE = 4.0
-"""Difference in nats below which LOO cannot tell models apart (Sivula et al. 2025)."""
+"""Difference in nats below which LOO cannot distinguish models (Sivula et al. 2025)."""
 _STANDARD_ERRORS = 2.0
-"""The same in standard errors of the difference."""
+"""The same threshold, in standard errors of the difference."""
 _ENOUGH_MISSIONS = 10
 """Number of missions below which the standard error of a difference is not reliable."""
 _SINGLE = 1e-6
-"""Difference of rates that is due to single precision, which JAX uses by default."""
+"""Difference between rates that can result from single precision, the default of JAX."""
 
 
 @computing()
@@ -34,33 +34,34 @@ def compare(
 ) -> pd.DataFrame:
     """Rank posteriors by leave-one-mission-out cross-validation; see `loo` and `arviz.compare`.
 
-    LOO of few missions often cannot decide. The column `verdict` says `"undecided"`, with the
-    reason, if the difference to the best is below 4 nats or below two of its standard errors, or
-    there are fewer than 10 missions. If a verdict is undecided, do not use the weights or the order
-    of the models. `p`, the effective number of parameters, should be much smaller than
-    `n_missions`.
+    With few missions, LOO often cannot tell which model is better. The column `verdict` is
+    `"undecided"`, followed by the reason, if the difference from the best model is below 4 nats or
+    below two standard errors, or if there are fewer than 10 missions. If a verdict is undecided, do
+    not use the weights or the order of the models. `p`, the effective number of parameters, should
+    be much smaller than `n_missions`.
 
     Args:
-        posteriors: Two or more posteriors by name, fitted to the same missions: from `fit`, of
-            model classes or NumPyro functions, or from `arviz.from_numpyro(mcmc,
-            log_likelihood=True)`. The latter needs a site `contact_rate` in a plate of missions and
-            the attribute `log_likelihood_of`, `"ticks"` if its `ContactRate` has `n_ticks`, or
-            `"contact_rate"` otherwise. It is refused if a mission would need a refit.
+        posteriors: Two or more posteriors by name, fitted to the same missions. Each is from `fit`,
+            for a model class or a NumPyro function, or from `arviz.from_numpyro(mcmc,
+            log_likelihood=True)`. The latter needs a site `contact_rate` in a plate of missions.
+            Its attribute `log_likelihood_of` must be `"ticks"` if its `ContactRate` has `n_ticks`,
+            and `"contact_rate"` otherwise. An error is raised if one of its missions would need a
+            refit.
         models: Models by the same names; needed for models with custom priors and for NumPyro
             functions that were not used before in this process.
         round_to: Number of decimal places, as in `arviz.compare`. `"auto"`, the default of ArviZ,
-            rounds `elpd` to the precision of its standard error, which hides differences between
-            models that are smaller; the default `"none"` does not round.
+            rounds `elpd` to the precision of its standard error, which hides smaller differences
+            between models. The default `"none"` does not round.
         progress: Whether to show a progress bar after 5 seconds.
 
     Returns:
         Table from `arviz.compare` with one row per posterior, the best first. The columns include
-        `elpd`, `p` and `n_missions`, `elpd_diff` and its standard error `dse` in nats, `verdict`,
-        the stacking `weight`, and `diag_elpd`, which names a high Pareto k.
+        `elpd`, `p`, `n_missions`, `elpd_diff` and its standard error `dse` (in nats), `verdict`,
+        the stacking `weight`, and `diag_elpd`, which reports a high Pareto k.
 
     Raises:
-        TrustboError: If there are fewer than two posteriors; their rates or tick counts differ; or
-            some log-likelihoods are of tick counts and others are densities of rates.
+        TrustboError: If there are fewer than two posteriors; if their rates or tick counts differ;
+            or if some log-likelihoods refer to tick counts and others to rates.
 
     Example:
         >>> pooled = tb.fit(missions, tb.models.PooledTrust())
@@ -89,7 +90,7 @@ def compare(
 
 
 def _require_same_data(targets: Mapping[str, LeftOut]) -> None:
-    """Raise TrustboError unless all log-likelihoods are of the same data."""
+    """Raise TrustboError unless all log-likelihoods refer to the same data."""
     first, *others = targets
     reference = targets[first]
     for name in others:
@@ -114,7 +115,7 @@ def _require_same_data(targets: Mapping[str, LeftOut]) -> None:
 
 
 def _verdicts(found: Mapping[str, ELPDData], names: list[str]) -> list[str]:
-    """Say in words which models are worse than the first, if LOO can decide; see `compare`."""
+    """State which models are worse than the first one, if LOO can tell; see `compare`."""
     best = found[names[0]]
     verdicts = []
     for name in names[1:]:

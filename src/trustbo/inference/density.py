@@ -21,7 +21,7 @@ _CHUNK = 32
 _NUMBERS = 5_000_000
 """Largest number of precision entries of the points evaluated at once."""
 CHAINED = 100
-"""Number of missions from which lasting effects are eliminated as chains."""
+"""Smallest number of missions at which lasting effects are eliminated as chains."""
 _FEW = 15
 """Number of missions with which the search for the mode begins."""
 _SIZES = (0.3, 1.0, 1.8, 2.6)
@@ -33,7 +33,7 @@ _SPREADS = (1e-2, 3.0)
 _LARGEST_NOISE = 50.0
 """Largest size of the noises whose density is computed; see `NormalScores`."""
 _LEAST_NOISE = 1e-6
-"""Least size of the noises whose density is computed."""
+"""Smallest size of the noises whose density is computed."""
 SWEEPS = 1
 """Number of EP sweeps at each point, beginning with the sites at the mode."""
 _SETTLED = 12
@@ -95,7 +95,7 @@ class Density:
         """Prepare the design matrix and blocks of a model for the observations."""
         self.model = model
         self.observations = observations
-        self.evaluated: Callable[[int], object] = lambda n: None  # called with numbers of points
+        self.evaluated: Callable[[int], object] = lambda n: None  # called with the number of points
         self.layout = model.layout(observations)
         self.scores = model.scores(observations)
         self.n_scores = self.scores.n_scores
@@ -128,7 +128,7 @@ class Density:
         prior = self._prior_of_fit(self.theta(np.zeros((1, self.n_scores))))
         free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in prior.parts])
 
-        # The rows of U are sorted by mission, equally many of each.
+        # The rows of U are sorted by mission, with equally many rows per mission.
         entries = self._U.tocoo()
         met = np.zeros((n_missions, n_columns), dtype=bool)
         met[entries.row * n_missions // n_rows, entries.col] = True
@@ -160,7 +160,7 @@ class Density:
         return np.where(np.isfinite(log_p), log_p, -np.inf)
 
     def visit(self, z: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Coefficients]:
-        """Compute the log density of scores, and the coefficients there, given Gaussian rates."""
+        """Compute the log density and the coefficients at each point, given Gaussian rates."""
         n_points = len(z)
         n_columns = self._U.shape[1]
         log_p = np.full(n_points, -np.inf)
@@ -211,7 +211,7 @@ class Density:
         return log_p
 
     def reset_ep(self) -> None:
-        """Forget the EP sites, so that results do not depend on what was computed before."""
+        """Forget the EP sites, so that results do not depend on earlier computations."""
         if not self.exact:
             self.sites = ep.first_sites(self.rates)
 
@@ -223,9 +223,10 @@ class Density:
             _, self.sites = ep.log_evidence(joint, self.sites, _SETTLED, _DAMPING)
 
     def start(self) -> np.ndarray:
-        """Return a start of the search for the mode or, with EP, the mode.
+        """Return a starting point for the search for the mode or, with EP, the mode itself.
 
-        With many missions, the start is the mode given the first few, whose density costs less.
+        With many missions, the starting point is the mode given the first few missions, for which
+        the density is cheaper to compute.
         """
         few = self.observations.first(_FEW)
         if self.observations.n_missions >= 2 * _FEW and not np.isnan(few.contact_rate).all():
@@ -235,25 +236,25 @@ class Density:
             best = self._best_of_four_starts()
 
         if not self.exact:
-            # The evidence by EP depends on the initial sites, which should be those at the mode.
+            # The EP evidence depends on the initial sites, which should be those at the mode.
             self.run_ep(self.theta(best[None]))
             best = climb(self.log_density, best)
             self.run_ep(self.theta(best[None]))
         return best
 
     def _best_of_four_starts(self) -> np.ndarray:
-        """Return the best of scores at which the noises have different sizes."""
+        """Return the best of four points, at which the noises have different sizes."""
         starts = np.zeros((len(_SIZES), self.n_scores))
         unit = self.model.likelihood.line_of_sight[0]
         ratio = unit * np.nanstd(self.observations.contact_rate) / _USUAL_NOISE
         spread = np.log(np.clip(ratio, *_SPREADS))
         starts[:, self.scores.noises] = spread - np.array(_SIZES)[:, None]
 
-        self.run_ep(self.theta(starts[1:2]))  # sites of the second start suit all four
+        self.run_ep(self.theta(starts[1:2]))  # the sites of the second start suit all four
         return starts[self.log_density(starts).argmax()]
 
     def defensive(self, proposal: Student) -> Student:
-        """Make a wider proposal for beta0, noises and sizes; other scores stay near the prior."""
+        """Widen a proposal for beta0, noises and sizes; keep other scores near the prior."""
         core = self.scores.core
         others = np.setdiff1d(np.arange(self.n_scores), core)
 
@@ -273,7 +274,7 @@ class Density:
 
         Args:
             z: Normal scores (point, score).
-            log_p: Log density (point,) of the scores by EP.
+            log_p: Log density (point,) of the scores, computed with EP.
             rng: Random number generator.
             n_sweeps: Number of EP sweeps at each point.
 
@@ -291,7 +292,7 @@ class Density:
         return JointDraws(theta, c, f), log_weight + self.scores.log_prior(z) - log_p
 
     def draw_coefficients(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
-        """Draw the coefficients (point, column) once at each point given Gaussian rates."""
+        """Draw the coefficients (point, column) once at each point, given Gaussian rates."""
         drawn = []
         for _, chunk in chunks(theta):
             fit, prior = self._fit(chunk)

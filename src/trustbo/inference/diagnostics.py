@@ -10,9 +10,9 @@ from arviz_stats import sampling_diagnostics
 from trustbo.inference.draws import require_posterior
 
 MAX_RHAT = 1.01
-"""Largest rank-normalised R-hat accepted from NUTS."""
+"""Largest rank-normalised R-hat that is accepted for NUTS."""
 MIN_ESS = 400.0
-"""Smallest bulk effective sample size accepted from NUTS."""
+"""Smallest bulk effective sample size that is accepted for NUTS."""
 NUTS_NAMES = ("r_hat", "ess_bulk", "divergences")
 """Names of the diagnostics of NUTS."""
 
@@ -21,8 +21,8 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
     """Return the diagnostics of the sampler that drew a posterior.
 
     Returns:
-        For importance sampling, `k_hat`, which is good below 0.5, and `kish`, the effective number
-        of points. For NUTS, the worst `r_hat` and `ess_bulk` over all hyperparameters, and the
+        For importance sampling, `k_hat`, which is good below 0.5, and the effective number of
+        points `kish`. For NUTS, the worst `r_hat` and `ess_bulk` over all hyperparameters, and the
         number of `divergences`.
 
     Raises:

@@ -61,11 +61,11 @@ def require_posterior(who: str, value: object) -> xr.DataTree:
 def parameters_of(posterior: xr.DataTree, model: TrustModel | None = None) -> dict[str, np.ndarray]:
     """Return the parameter draws of a posterior by name, with chains joined in an axis (draw,).
 
-    Variables that the model does not have, such as a user's own, are left out.
+    Variables that are not in the model, such as those added by a user, are left out.
 
     Raises:
-        TrustboError: If a parameter has other dims than the model's, or a draw is NaN, for example
-            after masking with xarray.
+        TrustboError: If the dims of a parameter differ from the model's, or if a draw is NaN, for
+            example after masking with xarray.
     """
     if model is None:
         model = model_of(posterior)
@@ -99,8 +99,8 @@ def parameters_of(posterior: xr.DataTree, model: TrustModel | None = None) -> di
 def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
     """Return draws (draw, ...) with chains joined and with the other axes in the order `axes`.
 
-    New draws and draws read from a file get the same memory layout, so that sums have the same
-    rounding errors and a resumed campaign is bit-identical.
+    New draws and draws that are read from a file get the same memory layout. Sums then have the
+    same rounding errors, which makes a resumed campaign bit-identical.
     """
     values = np.ascontiguousarray(array.transpose("chain", "draw", *axes).values)
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also for 0 draws
@@ -190,10 +190,11 @@ def _robot_effects_ahead(
     n_missions: int,
     is_drawn: bool,
 ) -> dict[str, np.ndarray]:
-    """Return the parameters (draw, robot, ...) that robot effects change in the next mission.
+    """Return the parameters (draw, robot, ...) that the robot effects of the next mission change.
 
-    `values` has the variables of each effect in the `n_missions` missions so far. The effects of
-    the next mission are drawn, or expected ones unless `is_drawn`.
+    `values` contains the variables of each effect in the `n_missions` missions so far. If
+    `is_drawn`, the effects of the next mission are drawn at random; otherwise, their expected
+    values are used.
     """
     if not values:
         return {}
@@ -233,9 +234,9 @@ def in_order_of(
 ) -> xr.DataTree:
     """Return a posterior with its robots and features in the order of these names.
 
-    Parameters that all robots share apply to any robots. Robots that occur only in missions of
-    earlier campaigns (attribute `other_robots`) are left out, unless they are among `robots`.
-    Raises TrustboError if names differ.
+    Parameters that all robots share apply to robots with any names. Robots that occur only in
+    missions of earlier campaigns (attribute `other_robots`) are left out, unless they are in
+    `robots`. Raises TrustboError if names differ.
     """
     others = np.atleast_1d(posterior.attrs.get("other_robots", [])).tolist()
     if others and not set(others) <= set(robots):
@@ -284,7 +285,7 @@ def _without_robots(posterior: xr.DataTree, others: Sequence[str]) -> xr.DataTre
 
 
 def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
-    """Return the effects in the model of a posterior; none for a function."""
+    """Return the effects in the model of a posterior; a function has none."""
     return effects_from_record(json.loads(posterior.attrs["model_record"]))
 
 
@@ -445,7 +446,7 @@ def _prior(model: TrustModel, n_features: int, n_robots: int) -> Density:
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:
-    """Rebuild missions from the data of a posterior; raises TrustboError if there are no data."""
+    """Rebuild missions from the data of a posterior; raise TrustboError if there are no data."""
     if "constant_data" not in posterior.children:
         raise TrustboError(
             "this posterior contains only parameters; give the fitted missions with missions=. "

@@ -5,13 +5,14 @@ block has trust x and a predictor f,
 
     x = m + T U c + e,    f = x + n,    e ~ N(0, S),  n ~ N(0, noise),  c ~ N(mean, precision^-1),
 
-where every observation is a Gaussian site N(y; f, 1 / lam). Sites are exact for Gaussian rates, and
-matched by expectation propagation (`ep`) for other families. With L L' = 1 + lam^1/2 (S + noise)
-lam^1/2 and W = L^-1 lam^1/2, the model is a regression of W (y - m) on W T U with unit noise.
-Products of columns for pairs of inputs, summed over blocks of one kind, do not depend on theta.
-Therefore, U' (W T)' (W T) U needs one sparse product for all theta and any number of missions.
+where every observation is a Gaussian site N(y; f, 1 / lam). Sites are exact for Gaussian rates. For
+other families, they are found by expectation propagation (`ep`). With L L' = 1 + lam^1/2 (S +
+noise) lam^1/2 and W = L^-1 lam^1/2, the model is a regression of W (y - m) on W T U with unit
+noise. Products of columns for pairs of inputs, summed over the blocks of one kind, do not depend on
+theta. Therefore, one sparse product suffices to compute U' (W T)' (W T) U for all theta and any
+number of missions.
 
-The same code runs in NumPy without compilation and in JAX with derivatives.
+The same code runs in NumPy, without compilation, and in JAX, with derivatives.
 """
 
 from collections.abc import Sequence
@@ -36,7 +37,7 @@ from trustbo.statespace.matrices import namespace
 
 
 class Blocks(NamedTuple):
-    """Data of all blocks, which do not depend on theta."""
+    """Data of all blocks; they do not depend on theta."""
 
     y: np.ndarray  # (block, row), 0 where not measured
     U: Any  # sparse (block * input, column)
@@ -58,20 +59,22 @@ class Blocks(NamedTuple):
             U: Design as a sparse matrix (block * input, column).
             label: Index (block,) of each block on the second axis of a `LinearPredictor`.
             order: Order in which the columns are eliminated.
-            apart: Whether each block is a separate kind, as needed if sites differ between blocks.
+            apart: Whether each block is a separate kind, which is needed if sites differ between
+                blocks.
         """
         n_blocks = len(y)
         n_columns = U.shape[1]
         n_inputs = U.shape[0] // n_blocks
         U = sparse.csr_array(U)
 
-        # A row of `kinds` is a number that may keep blocks apart, the label, and the seen rows.
+        # A row of `kinds` contains a number that can keep blocks apart, the label, and the seen
+        # rows.
         seen = ~np.isnan(y)
         number = np.arange(n_blocks) if apart else np.zeros(n_blocks, dtype=int)
         kinds, kind = np.unique(np.column_stack([number, label, seen]), axis=0, return_inverse=True)
         kind = kind.ravel()
 
-        # Pairs of inputs are unordered, so that one number stands for (k, j) and for (j, k).
+        # Pairs of inputs are unordered: one number stands for both (k, j) and (j, k).
         upper = np.triu_indices(n_inputs)
         n_pairs = len(upper[0])
         pair = np.zeros((n_inputs, n_inputs), dtype=int)
@@ -169,20 +172,22 @@ class Prior(NamedTuple):
         return self._add_chains(A, order)
 
     def with_chains(self, chains: Chains, first: int, n_missions: int) -> Self:
-        """Add hidden columns, the lasting parts of columns from `first`.
+        """Add hidden columns, which are the lasting parts of the columns from `first` onwards.
 
-        The other columns then have the precision of their independent part, which is in `parts`.
+        The other columns then have the precision of their independent parts, which is stored in
+        `parts`.
         """
         xp = namespace(chains.lasting)
         n_chains = chains.lasting.shape[1]
 
-        # A stationary AR(1) chain: the first state has the full variance, others 1 - rho^2 of it.
+        # In a stationary AR(1) chain, the first state has the full variance, and the innovations of
+        # the others have 1 - rho^2 of it.
         of_hidden = n_missions * xp.log(chains.lasting).sum(1)
         of_hidden = of_hidden - n_chains * (n_missions - 1) * np.log(1.0 - chains.rho**2)
         return self._replace(log_det=self.log_det + of_hidden, chains=chains, first=first)
 
     def _add_chains(self, A: Any, order: Order) -> Any:
-        """Add the precision of the hidden columns s, and their coupling to the columns s + e."""
+        """Add the precision of the hidden columns s and their coupling to the columns s + e."""
         independent, lasting, rho = self.chains  # pyright: ignore[reportGeneralTypeIssues]
         n_missions = len(order.hidden)
         s = order.hidden.T  # (chain, mission)
@@ -343,7 +348,8 @@ def marginals(
     M[..., k, j] = pairs.reshape(n_points, n_blocks, -1)
     M = M + np.swapaxes(M, 2, 3)
 
-    # Law of total variance: given c, and of the mean given c, which is linear in c.
+    # Law of total variance: the variance given c, plus the variance of the mean given c, which is
+    # linear in c.
     G = T - gain @ T
     var = np.diagonal(V, axis1=2, axis2=3) - (gain * V).sum(3) + ((G @ M) * G).sum(3)
     return mean, np.broadcast_to(var, (n_points, n_blocks, n_rows))

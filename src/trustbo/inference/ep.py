@@ -2,10 +2,11 @@
 
 Each likelihood term t(f) is replaced by a site exp(-lam f^2 / 2 + eta f). Given the sites, `engine`
 computes the marginals of the linear predictors exactly. Dividing a marginal by its site gives the
-cavity. The site is then updated so that the product of the cavity and the site has the moments of
-the product of the cavity and the likelihood term (Minka 2001; Rasmussen and Williams 2006, section
-3.6). The log evidence is the log evidence of the sites plus, for each term, the log ratio of the
-masses of these products. Importance weights correct the draws.
+cavity. The site is then updated to match moments: the product of the cavity and the new site has
+the same moments as the product of the cavity and the likelihood term (Minka 2001; Rasmussen and
+Williams 2006, section 3.6). The log evidence is the log evidence of the sites plus, for each term,
+the log ratio of the masses of these products. Importance weights correct the draws for the error of
+EP.
 """
 
 from typing import Any, NamedTuple
@@ -32,7 +33,7 @@ _TEMPERED = 0.6
 _LEAST_DEGREES = 8.0
 """Smallest number of degrees of freedom of a proposal of coefficients."""
 _JITTER = 1e-12
-"""Added to the covariance of the predictors of a block."""
+"""Number added to the covariance of the predictors of a block."""
 
 
 class Rates(NamedTuple):
@@ -103,7 +104,8 @@ def log_evidence(
 ) -> tuple[np.ndarray, Sites]:
     """Compute the EP log evidence (point,) and the sites after `n_sweeps` sweeps.
 
-    A sweep updates all sites at once (parallel EP). After the last, only the evidence is computed.
+    A sweep updates all sites at once (parallel EP). After the last sweep, only the evidence is
+    computed.
     """
     blocks, predictor, prior, rates = joint
     seen = ~np.isnan(rates.y)
@@ -173,7 +175,7 @@ def draw(
     narrow, wide = (center + F.back(t)[:, 0] for center, F in proposals)
     c = np.where(is_wide[:, None], wide, narrow)
 
-    # Density of the mixture, whichever of its parts was drawn from.
+    # The density is that of the mixture, regardless of which part was drawn from.
     of_narrow, of_wide = (_log_student(c, center, F, nu) for center, F in proposals)
     log_q = np.logaddexp(of_narrow, of_wide) - np.log(2.0)
 
@@ -216,7 +218,7 @@ def draw_predictors(
     e = np.zeros(mean.shape)
     log_weight = log_sites - 0.5 * (w**2).sum(2)
     for k in range(n_rows):
-        # Given the rows before it, row k is N(a, d^2) with its own site, N(m, v) without.
+        # Given the rows before it, row k is N(a, d^2) with its own site and N(m, v) without it.
         a = mean[..., k] + (G[..., k, :k] * e[..., :k]).sum(-1)
         d = G[..., k, k]
         d2 = np.broadcast_to(d**2, a.shape)

@@ -7,13 +7,13 @@ independent. With the leaves first, the precision A = F F' and its factor F are
     A = [D  B ]    F = [G   0 ]    G G' = D,  X = G^-1 B,  H' H = C - X' X,
         [B' C ]        [X'  H']
 
-where D and G are block diagonal, with one block per mission. Only H is a large dense factor. LAPACK
-factors upper triangles fastest and in place, because LAPACK stores columns contiguously.
+where D and G are block diagonal, with one block per mission. Only H is a large dense factor. Since
+LAPACK stores columns contiguously, it factors upper triangles fastest, and in place.
 
-Effects that last over many missions can be split (see `Chains`). Then, their independent parts are
-leaves, and their lasting parts are hidden columns, which are the first columns of the core. Each is
-coupled only to its mission and, a priori, to the missions before and after, so its part of C is
-block tridiagonal, which saves half of the work.
+Effects that last over many missions can be split (see `Chains`). Their independent parts are then
+leaves, and their lasting parts are hidden columns, which are the first columns of the core. A
+hidden column is coupled only to its mission and, a priori, to the missions before and after it. The
+part of C with the hidden columns is therefore block tridiagonal, which saves half of the work.
 """
 
 from typing import Any, NamedTuple, Self
@@ -31,11 +31,12 @@ from trustbo.statespace.matrices import namespace
 CHAIN_BLOCK = 30
 """Number of columns of a chain that are eliminated at once."""
 _DENSE = 20
-"""A sparse matrix with more than one entry in this many is multiplied as a dense one in JAX."""
+"""In JAX, a sparse matrix is multiplied as a dense one if more than one entry in this many is
+nonzero."""
 
 
 class Order(NamedTuple):
-    """Order in which columns are eliminated, and storage of the blocks D, B and C in a vector."""
+    """Order in which columns are eliminated, and layout of the blocks D, B and C in a vector."""
 
     leaf: np.ndarray  # (mission, place), leaf columns, padded with the number of columns
     core: np.ndarray  # core columns
@@ -63,7 +64,8 @@ class Order(NamedTuple):
         free = np.append(free, np.zeros(hidden.size, dtype=bool))
         n_columns = len(free)
 
-        # A leaf is free and occurs in one mission; with one mission, nothing is gained by leaves.
+        # A leaf is free and occurs in one mission. If there is only one mission, leaves gain
+        # nothing.
         is_leaf = free & (met.sum(0) == 1)
         if n_missions == 1:
             is_leaf[:] = False
@@ -131,7 +133,7 @@ class Order(NamedTuple):
         in_C = g * k * (k + t) + self.place[a] * q + self.place[b]
         index = np.where(a_is_leaf, np.where(both_leaves, in_D, in_B), in_C)
 
-        # Of D, the lower triangle is stored; of C, the upper one; B has no rows of the core.
+        # The lower triangle of D and the upper triangle of C are stored; B has no rows of the core.
         is_other = np.where(
             both_leaves, self.place[a] < self.place[b], self.place[a] > self.place[b]
         )
@@ -209,7 +211,7 @@ class Factor(NamedTuple):
         leaf = xp.moveaxis(leaf, 1, 3) - self.X @ touched
         leaf = xp.moveaxis(xp.swapaxes(self.inverse, 2, 3) @ leaf, 3, 1)
 
-        # Sort from leaves and core into the order of the columns; -1 marks the core in `group`.
+        # Rearrange leaves and core in the order of the columns; -1 marks the core in `group`.
         found = xp.concatenate([leaf.reshape(*leaf.shape[:2], n_leaves), core], axis=2)
         group = np.where(order.group < 0, len(order.leaf), order.group)
         return found[..., group * order.leaf.shape[1] + order.place]
@@ -229,7 +231,7 @@ class Factor(NamedTuple):
         return np.concatenate([leaf.reshape(len(c), -1), core], axis=1)
 
     def covariance(self) -> Any:
-        """Compute A^-1 at the stored entries of A, with halved diagonals for sums over pairs."""
+        """Compute A^-1 at the stored entries of A, with diagonals halved for sums over pairs."""
         C = inverse_of_upper(self.H)
         transposed = self.inverse.swapaxes(2, 3)
 
@@ -283,7 +285,7 @@ def add_products(A: Any, at: np.ndarray, M: Any, x: Any) -> Any:
 
     Args:
         A: Vectors (point, entry), contiguous in NumPy.
-        at: Different indices (row,) of entries.
+        at: Distinct indices (row,) of entries.
         M: Sparse matrix (row, column).
         x: Vectors (point, column).
     """
@@ -341,10 +343,10 @@ def upper_factor(A: Any) -> Any:
 
 
 def chain_factor(A: Any, n_missions: int, n_chains: int) -> Any:
-    """Factor matrices as `upper_factor`, if their first columns (mission, chain) are a chain.
+    """Factor matrices as `upper_factor` does, if their first columns (mission, chain) are a chain.
 
-    A column of the chain may be coupled only to columns of the same mission, the mission before and
-    the mission after, and to columns outside of the chain.
+    A column of the chain may be coupled only to columns of the same mission, of the mission before
+    and of the mission after it, and to columns outside the chain.
     """
     if not isinstance(A, np.ndarray):
         return upper_factor(A)
@@ -352,7 +354,8 @@ def chain_factor(A: Any, n_missions: int, n_chains: int) -> Any:
     n = n_missions * n_chains
     step = n_chains * -(-CHAIN_BLOCK // n_chains)  # whole missions
     for one in A:
-        # Block Cholesky: columns i:j of the chain are coupled to j:k and, outside of it, to n:.
+        # Block Cholesky: columns i:j of the chain are coupled to columns j:k and, outside the
+        # chain, to columns n:.
         for i in range(0, n, step):
             j = min(i + step, n)
             k = min(j + step, n)
