@@ -69,13 +69,13 @@ class TrustForecast(NamedTuple):
 class TrustFilter:
     """Rao-Blackwellised filter for the trust of each robot during a mission.
 
-    Given a parameter draw and Gaussian rates, trust is Gaussian and the Kalman filter is exact. For
-    other families, moments are matched after each observed rate (assumed-density filtering). The
-    draws are reweighted by the predictive density of the rates. After bound k, the filter
+    If rates are Gaussian, trust is Gaussian given a parameter draw, and the Kalman filter is exact.
+    For other families, moments are matched after each observed rate (assumed-density filtering).
+    The draws are reweighted by the predictive density of the rates. After bound k, the filter
     approximates p(trust, parameters | earlier missions, bounds 1..k).
 
-    To follow a bound tick by tick, update a copy of the filter with the rate so far, as in
-    `tb.Follower`.
+    To follow a bound tick by tick, update a copy of the filter with the rate so far, as
+    `tb.Follower` does.
 
     Attributes:
         params: Parameter draws with the leading axis (draw,).
@@ -109,13 +109,13 @@ class TrustFilter:
             n_robots: Number of robots; needed only with `TrustParams`.
             family: Observation family of parameter draws; ignored for a DataTree.
             max_draws: Maximum number of draws; if there are more, evenly spaced draws are selected.
-            workspace: Workspace whose robots and features the filter follows, in this order. By
+            workspace: Workspace, whose order of robots and features applies to all arrays. By
                 default, arrays without labels are in the order of the draws.
 
         Raises:
-            TrustboError: If the posterior has other robots or features than the workspace, the
-                number of robots does not match the draws, the posterior is not
-                from `fit`, or `TrustParams` are given without `n_robots`.
+            TrustboError: If the robots or features of the posterior differ from those of the
+                workspace; the number of robots does not match the draws; the posterior is not from
+                `fit`; or `TrustParams` are given without `n_robots`.
         """
         self._bounded = True
         self._names: dict[str, Names | None] = {"robot": None, "feature": None}
@@ -219,7 +219,7 @@ class TrustFilter:
         counts = self.space.grouped(ticks)
         self._belief, gained = kalman.update(self.space, predicted, rates, counts, self.likelihood)
 
-        # Draws that predicted the rates better get more weight.
+        # Draws that predicted the rates better get larger weights.
         self._log_weight = self._log_weight + gained  # a new array, as copies share the old one
         weights = np.exp(self._log_weight - self._log_weight.max())
         self.weights = weights / weights.sum()
@@ -240,7 +240,8 @@ class TrustFilter:
     def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
         """Predict trust and contact rates along future bounds.
 
-        One rate per bound and robot is drawn for each parameter draw. Tick counts are out of 200.
+        One rate per bound and robot is drawn for each parameter draw. Future bounds are assumed to
+        have 200 ticks.
 
         Args:
             awareness: Awareness along the path, shape (bound, robot, feature).
@@ -251,7 +252,7 @@ class TrustFilter:
                 [0, 1]; or the path is missing, has the wrong length, jumps or leaves the grid.
         """
         given = self._checked(awareness, 3)
-        rng = np.random.default_rng(self.n_bounds)  # so that a repeated prediction is the same
+        rng = np.random.default_rng(self.n_bounds)  # makes repeated predictions identical
 
         inputs = self.inputs(given, path)
         ticks = self.space.grouped(np.full(given.shape[:2], _TICKS))
@@ -278,7 +279,7 @@ class TrustFilter:
         return [self.params.as_inputs(self.space.grouped(u[..., k])) for k in range(len(awareness))]
 
     def _bounds(self, path: Sequence[Cell] | None, n_bounds: int) -> np.ndarray:
-        """Return moves, rows and columns (bound, 3) of a path; moves are -1 if they do not matter.
+        """Return the moves, rows and columns (bound, 3) of a path; moves are -1 if not needed.
 
         Raises:
             TrustboError: If the path is missing, has the wrong length, jumps or leaves the grid.

@@ -46,7 +46,7 @@ from trustbo.workspace import Workspace
 SAMPLERS = ("importance", "nuts")
 """Names of the samplers of `fit`."""
 _CORRECTED = 2
-"""Number of draws whose density by EP is corrected, per point of a round."""
+"""Number of draws for which the EP density is corrected, per point of a round."""
 _SIZE = 256
 """Points per round of the importance sampler."""
 _LAST_SIZE = 1024
@@ -54,7 +54,7 @@ _LAST_SIZE = 1024
 _LAST_SWEEPS = 4
 """EP sweeps at each point in the last attempt; usually `SWEEPS`."""
 _MANY_SCORES = 12
-"""Number of scores from which a round has four times as many points."""
+"""Smallest number of scores for which a round has four times as many points."""
 
 
 @Renamed(whole="latent")
@@ -80,45 +80,48 @@ def fit(
     Args:
         missions: Missions of one team; NaN marks contact rates that were not measured.
         model: Trust model, or a NumPyro function `model(awareness, contact_rate=None)` (see
-            `models.ContactRate` and the how-to "Your own model"). By default
+            `models.ContactRate` and the how-to "Your own model"). The default is
             `models.default_model()` with place and robot effects; place effects are omitted if a
             mission has no map or a path jumps. For reports of people (see `logs.read_reports`), the
             default is `HumanTrust` with the scale of the reports.
-        earlier: Missions of earlier campaigns, which are data like `missions` and come first. They
-            are not changed to match the workspace. Their robots are matched by name, and may be
-            others; their places are those of the workspace only if `Mission.map` is "".
-        sampler: `"importance"` takes independent draws by adaptive importance sampling without
+        earlier: Missions of earlier campaigns. They are data like `missions` and precede them, but
+            are not changed to match the workspace. Their robots are matched by name, and may
+            include robots that are not in `missions`. Their places are those of the workspace only
+            if `Mission.map` is "".
+        sampler: `"importance"` takes independent draws by adaptive importance sampling. It needs no
             compilation, and integrates out all variables except hyperparameters. `"nuts"` uses
-            NumPyro's NUTS, which also samples trust unless rates are Gaussian. By default
-            `"importance"`, and `"nuts"` for functions, for which there is no other sampler.
+            NumPyro's NUTS, which also samples trust unless rates are Gaussian. The default is
+            `"importance"` for model classes and `"nuts"` for functions, which have no other
+            sampler.
         workspace: Workspace of the missions. If given, features and robots are reordered to match
             the workspace, missing awareness such as line of sight is filled in (see
             `Workspace.fill`), and place effects cover the whole grid. Missions over cells without
-            awareness are then left out with a warning. Otherwise, the grid of place effects ends at
-            the last row and column visited.
+            awareness are then left out, with a warning. Without a workspace, the grid of place
+            effects ends at the last row and column visited.
         draws: Number of draws per chain.
-        chains: Number of chains of NUTS. Importance sampling returns as many draws in one chain,
-            because its draws are independent of each other.
-        warmup: Number of warm-up draws per chain of NUTS, which are discarded; by default 150 for
-            Gaussian rates, for which only the step size is tuned, and 300 for others.
+        chains: Number of NUTS chains. Importance sampling returns the same total number of draws in
+            one chain, because its draws are independent of each other.
+        warmup: Number of warm-up draws per NUTS chain, which are discarded. The default is 150 for
+            Gaussian rates, for which only the step size is tuned, and 300 otherwise.
         seed: Random seed; the same seed gives the same posterior.
         progress: Whether to show a progress bar; importance sampling shows it after 5 seconds.
-        check: Whether to raise an error if diagnostics are bad: k-hat > 0.7 for importance
-            sampling; R-hat > 1.01, bulk ESS < 400 or any divergence for NUTS.
+        check: Whether to raise an error if the diagnostics are bad. For importance sampling, this
+            means k-hat > 0.7; for NUTS, R-hat > 1.01, bulk ESS < 400 or any divergence.
         latent: Whether to add latent trust, log-likelihoods and predictions, as `add_latent` does.
         start: Posterior of the same model given similar data, such as all missions but the last.
-            Importance sampling then begins with its proposal instead of a search for the mode.
+            Importance sampling then begins with the proposal of this posterior instead of a search
+            for the mode.
 
     Returns:
-        An ArviZ DataTree. `posterior` contains the parameters (for `PooledTrust` beta0,
+        An ArviZ DataTree. `posterior` contains the parameters (for `PooledTrust`, these are beta0,
         beta[feature], b, delta_w and delta_v), and each effect has a separate group. `latent`
-        contains trust[chain, draw, mission, bound, robot], and trust_mean and trust_sd over all
-        draws. `log_likelihood` contains contact_rate[chain, draw, mission], so that LOO leaves out
-        whole missions. If all rates have n_ticks, the log-likelihoods refer to tick counts (see the
-        attribute `log_likelihood_of`) and are comparable between observation families. Other groups
-        are `posterior_predictive`, `prior`, `prior_predictive`, `log_prior`, `sample_stats`,
-        `observed_data` and `constant_data`. Bounds are labelled from 1, and short missions are
-        padded with NaN.
+        contains trust[chain, draw, mission, bound, robot], and its mean trust_mean and standard
+        deviation trust_sd over all draws. `log_likelihood` contains contact_rate[chain, draw,
+        mission], so that LOO leaves out whole missions. If all rates have n_ticks, the
+        log-likelihoods refer to tick counts (see the attribute `log_likelihood_of`) and are
+        comparable between observation families. Other groups are `posterior_predictive`, `prior`,
+        `prior_predictive`, `log_prior`, `sample_stats`, `observed_data` and `constant_data`. Bounds
+        are labelled from 1, and short missions are padded with NaN.
 
     Raises:
         TrustboError: If there are no missions; robots or features differ between missions; an
@@ -189,10 +192,10 @@ def fit(
 def require_poolable_with_model(
     model: TrustModel, earlier: Sequence[Mission], robots: Sequence[str]
 ) -> None:
-    """Raise TrustboError if a model needs the same robots in all missions, and `earlier` differs.
+    """Raise TrustboError if a model needs the same robots in all missions and `earlier` has others.
 
-    In missions of other robots, a robot has no rates. This needs no change unless robots influence
-    each other.
+    A robot has no rates in the missions of other robots. Only models in which robots influence each
+    other cannot handle such gaps.
     """
     if model.joint and not model.exchangeable:
         require_same_robots(type(model).__name__, earlier, robots)
@@ -209,7 +212,7 @@ def _joined(
         missions = [workspace.fill(mission) for mission in missions]
         missions = [missions[j] for j in known_awareness(missions)]
         if not earlier:
-            require_same_team(missions)  # also that one is left
+            require_same_team(missions)  # also raises an error if none is left
 
     if missions:
         robots = missions[0].robots
@@ -246,7 +249,7 @@ def _fit_model(
     progress: bool,
     start: xr.DataTree | None,
 ) -> tuple[xr.DataTree, list[str], Callable[[xr.DataTree], xr.DataTree]]:
-    """Fit a model class; return the posterior, failed checks, and a function as `add_latent`."""
+    """Fit a model class; return the posterior, failed checks and a function like `add_latent`."""
     model = model.for_features(missions[0].features)
     density = Density(model, model.observations(missions, workspace))
     if sampler == "importance":
@@ -284,7 +287,7 @@ def _fit_model(
 def by_importance(
     density: Density, n: int, seed: int, first: Student | None = None
 ) -> tuple[JointDraws, dict[str, np.ndarray], dict[str, Any]]:
-    """Draw n times by importance sampling; return draws, statistics (draw,) and a summary.
+    """Take n draws by importance sampling; return the draws, statistics (draw,) and a summary.
 
     `first` is the first proposal. By default, or if its weights are uneven, the first proposal is
     found by a search for the mode.
@@ -313,7 +316,7 @@ def _exact_draws(
     rng: np.random.Generator,
     first: Student | None,
 ) -> tuple[JointDraws, np.ndarray, dict[str, Any]]:
-    """Draw n times given Gaussian rates, for which the log density of scores is exact."""
+    """Take n draws given Gaussian rates, for which the log density of scores is exact."""
     visited: list[Coefficients] = []
 
     def visit(z: np.ndarray) -> np.ndarray:
@@ -339,10 +342,11 @@ def _ep_draws(
     rng: np.random.Generator,
     first: Student | None,
 ) -> tuple[JointDraws, np.ndarray, dict[str, Any]]:
-    """Draw n times given other rates, and correct the density of scores by EP with weights."""
+    """Take n draws given other rates, with weights that correct the EP density of the scores."""
     points = _points(density, size, rng, first)
 
-    # Correcting EP at these points takes most time, but more points make k-hat more reliable.
+    # Correcting EP at these points takes most of the time, but more points make k-hat more
+    # reliable.
     some = points.resample(_CORRECTED * size, rng)
     drawn, log_ratio = density.draw_by_ep(points.z[some], points.log_p[some], rng, n_sweeps)
     weight, k_hat, log_mean = smoothed(log_ratio)
@@ -401,7 +405,7 @@ def _laid_out(
         group: {name: v.reshape(*shape, *v.shape[1:]) for name, v in values.items()}
         for group, values in groups.items()
     }
-    places = groups.pop("places", None)  # has axes of its own
+    places = groups.pop("places", None)  # has its own axes
 
     prior_draws = prior_parameters(density, N_PRIOR, rng)
     groups["prior"] = {name: values[None] for name, values in prior_draws.items()}

@@ -1,4 +1,4 @@
-"""Inputs of a model that is a NumPyro function, by the names of its parameters."""
+"""Inputs of a model that is a NumPyro function, keyed by the names of its parameters."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,9 +10,9 @@ from trustbo.models.observations import Observations
 from trustbo.workspace.moves import bounds_along
 
 RATES = "contact_rate"
-"""Name of the site, and of the input, with the contact rates."""
+"""Name of the site and of the input that contain the contact rates."""
 NAMES = ("awareness", RATES, "n_ticks", "duration", "cell", "bound", "features", "observations")
-"""Names of all inputs; `observations` are all data as `Observations`, without padding."""
+"""Names of all inputs; `observations` stands for all data as `Observations`, without padding."""
 _NOT_ARRAYS = ("features", "observations")
 """Inputs that compiled functions cannot take as arguments."""
 _STEP_OF_BOUNDS = 8
@@ -39,11 +39,11 @@ def arrays_of(data: Data) -> dict[str, Any]:
 def data_of(
     missions: Sequence[Mission], observations: Observations, *, moves: bool = True
 ) -> dict[str, Any]:
-    """Return the inputs of missions, padded so that a function is compiled for few shapes.
+    """Return the inputs of missions, padded so that functions are compiled for only a few shapes.
 
-    In the padding, contact_rate is NaN, indices are -1, and the other inputs are 0, because a drift
-    of NaN would make gradients NaN, even in bounds without rates.
-    Without `moves`, moves are -1, so that paths may jump; with `moves`, a jump is a TrustboError.
+    In the padding, contact_rate is NaN, indices are -1, and the other inputs are 0. These are not
+    NaN, because a NaN drift would make gradients NaN even in bounds without rates. If `moves` is
+    False, all moves are -1, and paths may jump; otherwise, a jump raises a TrustboError.
     """
     n_missions, n_bounds = observations.contact_rate.shape[:2]
     missing = (
@@ -59,7 +59,7 @@ def data_of(
         n_ticks[j, driven] = mission.n_ticks
         duration[j, driven] = mission.duration
         if mission.path:
-            path = mission.path[: len(mission.bounds) + 1]  # failed missions do not complete it
+            path = mission.path[: len(mission.bounds) + 1]  # failed missions do not complete the path
             bound[j, driven, 1:] = path[1:]
             if moves:
                 bound[j, driven] = bounds_along(path)

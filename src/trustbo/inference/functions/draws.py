@@ -20,19 +20,19 @@ from trustbo.models.draws import Draws
 from trustbo.statespace import Inputs, StateSpace
 
 _NUMBERS = 4_000_000
-"""Most inputs that are computed at once."""
+"""Largest number of inputs that are computed at once."""
 _SEED = 20261126
-"""Seed of variables of one mission each, which are drawn for the next mission."""
+"""Seed for the variables of single missions, which are drawn for the next mission."""
 _SAME = 1e-9
 """Largest difference, relative to the largest input, of inputs that should be equal."""
 _N_CHECKED = 2
-"""Draws for which `require_plannable` runs the function."""
+"""Number of draws for which `require_plannable` runs the function."""
 
 
 class FunctionDraws(Draws):
-    """Draws of the variables of a function, or the mean of the form and inputs over these draws.
+    """Draws of the variables of a function, or the mean form and inputs over these draws.
 
-    The inputs of bounds are found by running the function on these bounds as one mission.
+    To find the inputs of bounds, the function is run on these bounds as one mission.
 
     Attributes:
         model: The function.
@@ -62,13 +62,13 @@ class FunctionDraws(Draws):
         features: Sequence[str],
         shape: tuple[int, int] | None,
     ) -> None:
-        """Store the draws; `values` does not include variables of one mission each."""
+        """Store the draws; `values` does not include the variables of single missions."""
         self.model = model
         self.values = dict(values)
         self.robots = tuple(robots)
         self.features = tuple(features)
         self.shape = shape
-        self._numbers = np.arange(len(next(iter(self.values.values()))))  # of the random keys
+        self._numbers = np.arange(len(next(iter(self.values.values()))))  # numbers of the random keys
         self._of_mean = False
         self._is_flat = True  # whether a mean has a leading axis
         self._form: StateSpace | None = None
@@ -119,7 +119,7 @@ class FunctionDraws(Draws):
 
     @property
     def _space(self) -> StateSpace:
-        """State-space form of each draw or of the mean, which depends on no bound."""
+        """State-space form of each draw or of the mean; it is the same for all bounds."""
         if self._form is None:
             nothing = np.zeros((1, self.n_robots, self.n_features))
             data = self._data(nothing, np.full((1, 3), -1))
@@ -131,7 +131,7 @@ class FunctionDraws(Draws):
         return self._form
 
     def require_valid(self, n_robots: int | None = None, n_features: int | None = None) -> None:
-        """See `Draws.require_valid`; values of a posterior are valid."""
+        """See `Draws.require_valid`; the values of a posterior are always valid."""
         for what, given, own in (
             ("robots", n_robots, self.n_robots),
             ("features", n_features, self.n_features),
@@ -203,7 +203,7 @@ class FunctionDraws(Draws):
         return StateSpace(*fields), inputs
 
     def _wrong_size(self) -> str:
-        """Say that a variable of all missions cannot be used for the next one."""
+        """Return a message that a variable of all missions cannot be used for the next one."""
         return (
             f"a variable of {self.model.in_short()} has a size that depends on the number of "
             "missions or bounds, so it cannot plan; sample variables of one mission each within "
@@ -226,8 +226,9 @@ class FunctionDraws(Draws):
     def require_plannable(self, awareness: np.ndarray) -> None:
         """Raise TrustboError if the drift of a bound depends on anything but this bound.
 
-        The function runs on the bounds of the map as one mission, and on half of them, in another
-        order, as two missions. The drift of a bound, and the parameters, must be the same.
+        The function is run on the bounds of the map as one mission, and on half of them as two
+        missions, in a different order. The drift of each bound and the parameters must be the same
+        in both runs.
 
         Args:
             awareness: Awareness of the map, shape (robot, move, row, col, feature).
@@ -239,7 +240,7 @@ class FunctionDraws(Draws):
         z = z[known]
         bounds = bounds[known]
 
-        # Variables of one mission each are the same in all runs.
+        # The variables of single missions have the same values in all runs.
         data = some._data(z, bounds)
         of_missions = some._drawn_for_mission(data)
         first, inputs = some._run(some.values | of_missions, some._numbers, data)
@@ -281,7 +282,7 @@ class FunctionDraws(Draws):
             )
 
     def _drawn_for_mission(self, data: Data) -> dict[str, np.ndarray]:
-        """Draw the variables of one mission each, for one mission, by name."""
+        """Draw the variables of single missions for one mission; return them by name."""
         sites = self.model.sites(data)
         names = [name for name, site in sites.items() if site.mission_axis is not None]
         if not names:
@@ -302,7 +303,7 @@ class FunctionDraws(Draws):
         return other
 
     def _some(self, index: Any) -> "FunctionDraws":
-        """Return some of the draws, even of a mean."""
+        """Return some of the draws, also if the object is a mean."""
         other = copy(self)
         other.values = {name: values[index] for name, values in self.values.items()}
         other._numbers = self._numbers[index]

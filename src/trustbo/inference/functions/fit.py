@@ -59,25 +59,25 @@ _WARMUP = 300
 _ACCEPT = 0.95
 """Target of the acceptance probability."""
 _LAST_ACCEPT = 0.99
-"""The same after a divergent transition."""
+"""Target of the acceptance probability after a divergent transition."""
 _ATTEMPTS = 4
-"""Runs of NUTS after which bad diagnostics are reported, if each has many draws."""
+"""Number of NUTS runs after which bad diagnostics are reported, if each run has many draws."""
 _PATIENT = 2
-"""Runs after which the chains of the drift may count instead of those of the variables."""
+"""Number of runs after which the chains of the drift may be checked instead of the variables'."""
 _TOLERATED = 0.005
-"""Share of divergent transitions that is then accepted with a warning."""
+"""Fraction of divergent transitions that is accepted from then on, with a warning."""
 _ROUGH_RHAT = 1.1
-"""Largest R-hat of the drift and the noises that is accepted in the end, with a warning."""
+"""Largest R-hat of the drift and the noises that the last check accepts, with a warning."""
 _ROUGH_ESS = 50.0
-"""Smallest bulk ESS of the same."""
+"""Smallest bulk ESS of the drift and the noises that the last check accepts."""
 _CHECKED = 100
-"""Most measured bounds whose drift is checked."""
+"""Largest number of measured bounds whose drift is checked."""
 _MOST_ATTEMPTS = 10
-"""Most runs, however short."""
+"""Largest number of runs, however short."""
 _MANY = 4000
-"""Draws per chain in all runs before bad diagnostics are reported."""
+"""Total number of draws per chain, over all runs, before bad diagnostics are reported."""
 _SIZE = 200
-"""Draws whose latent trust is drawn at once."""
+"""Number of draws for which latent trust is drawn at once."""
 _STATS = {
     "num_steps": "n_steps",
     "diverging": "diverging",
@@ -102,7 +102,7 @@ def fit_function(
 ) -> tuple[xr.DataTree, list[str]]:
     """Fit a function to missions with NUTS; for the arguments, see `trustbo.fit`.
 
-    If the diagnostics are bad and `check` is true, NUTS goes on; see `_sampled`.
+    If the diagnostics are bad and `check` is true, NUTS is run again; see `_sampled`.
 
     Returns:
         The posterior of the parameters, and a list of failed checks.
@@ -148,7 +148,7 @@ def fit_function(
 
 
 def _warn(model: FunctionModel, verdict: "Verdict", n_transitions: int) -> None:
-    """Warn of what was accepted although it is outside the limits."""
+    """Warn about diagnostics that were accepted although they exceed the usual limits."""
     n_diverged = int(verdict.diagnostics["divergences"])
     r_hat = verdict.diagnostics["r_hat"]
     ess = verdict.diagnostics["ess_bulk"]
@@ -255,7 +255,7 @@ def log_likelihood_of_function(
 ) -> tuple[np.ndarray, bool]:
     """Compute the log-likelihood (draw, mission) of missions at all draws of a posterior.
 
-    The posterior may be given other rates of the same missions.
+    The posterior may have been fitted to other rates of the same missions.
 
     Returns:
         The log-likelihoods, and whether they are of tick counts.
@@ -280,7 +280,7 @@ def forms_of_function(
 
     Yields:
         For each chunk of draws, the form (draw, group, member), the inputs (draw, mission, bound,
-        group, member), and whether log-likelihoods of these missions are of tick counts.
+        group, member), and whether the log-likelihoods of these missions are of tick counts.
     """
     observations = Observations.from_missions(missions)
     data = _data_for(model, missions, observations)
@@ -293,9 +293,9 @@ def forms_of_function(
 def _evaluated(
     model: FunctionModel, posterior: xr.DataTree, data: Data, some: np.ndarray
 ) -> Iterator[tuple[np.ndarray, Found]]:
-    """Run a function with some draws of its posterior; yield chunks of their indices, and results.
+    """Run a function with some draws of its posterior; yield chunks of indices with their results.
 
-    A draw has the same random key whichever other draws are chosen.
+    The random key of a draw does not depend on which other draws are chosen.
     """
     values = _padded_values(posterior, model.sites(data))
     keys = _keys(len(next(iter(values.values()))), posterior.attrs["seed"])
@@ -318,7 +318,8 @@ def draws_of_function(
     """Return the draws of a posterior of a function, for the bounds of a workspace.
 
     Raises:
-        TrustboError: If the robots or features of the workspace are others, or in another order.
+        TrustboError: If the workspace has different robots or features, or the same in a different
+            order.
     """
     robots = tuple(posterior.attrs["robots"])
     features = tuple(posterior.attrs["features"])
@@ -382,8 +383,8 @@ def require_poolable_with_function(
 ) -> None:
     """Raise TrustboError if a function cannot be fitted to missions of earlier campaigns.
 
-    A function reads robots by place, and the cells of another map would be read as those of the
-    workspace.
+    A function identifies robots by position, and it would take the cells of another map for those
+    of the workspace.
     """
     require_same_robots(model.in_short(), earlier, robots)
     of_places = [name for name in ("cell", "bound") if name in model.inputs]
@@ -397,7 +398,7 @@ def require_poolable_with_function(
 def _data_for(
     model: FunctionModel, missions: Sequence[Mission], observations: Observations
 ) -> dict[str, Any]:
-    """Return the inputs of a function; data that it takes as one object are not padded."""
+    """Return the inputs of a function; data that it takes as a single object are not padded."""
     data = data_of(missions, observations, moves="bound" in model.inputs)
     if model.needs_observations:
         n_missions, n_bounds = observations.contact_rate.shape[:2]
@@ -407,7 +408,7 @@ def _data_for(
 
 
 def _nothing(model: FunctionModel, n_robots: int, features: tuple[str, ...]) -> dict[str, Any]:
-    """Return the inputs of one mission of one bound without contact rates."""
+    """Return the inputs of a mission with one bound and no contact rates."""
     z = np.zeros((1, n_robots, len(features)))
     data = data_of_bounds(z, np.full((1, 3), -1), features)
     if model.needs_observations:
@@ -416,7 +417,7 @@ def _nothing(model: FunctionModel, n_robots: int, features: tuple[str, ...]) -> 
 
 
 def _sampler(model: FunctionModel) -> Sampler:
-    """Return the sampler of a function, with what was compiled for it before."""
+    """Return the sampler of a function, which keeps earlier compilations."""
     if model.sampler is None:
         model.sampler = Sampler(model)
     return model.sampler
@@ -429,18 +430,19 @@ class Verdict(NamedTuple):
     complaints: list[str]
     """Failed checks."""
     not_identified: list[str]
-    """Variables whose chains differ, although those of the drift and the noises agree."""
+    """Variables whose chains differ although the chains of the drift and the noises agree."""
 
 
 def _judge(
     model: FunctionModel, data: Data, samples: Samples, *, patient: bool, last: bool = False
 ) -> Verdict:
-    """Check the chains of the variables or, if they are bad and `patient`, of what plans depend on.
+    """Check the chains of the variables or, if `patient`, of the quantities that plans depend on.
 
-    Variables may differ between chains although the drift does not, such as the weights of a neural
-    network, whose units can be exchanged. With `patient`, a few divergences are accepted, too. In
-    the `last` check, the limits for the drift and the noises are wider: plans from a rough
-    posterior are better than plans that ignore a mission.
+    Variables may differ between chains although the drift does not. An example is the weights of a
+    neural network, whose units can be exchanged. Therefore, if `patient` is true and the chains of
+    the variables are bad, those of the drift and the noises are checked instead. A few divergences
+    are then accepted, too. In the `last` check, the limits for the drift and the noises are wider,
+    because plans from a rough posterior are better than plans that ignore a mission.
     """
     diverging = samples.fields["diverging"]
     most = int(_TOLERATED * diverging.size) if patient else 0
@@ -456,7 +458,7 @@ def _judge(
     if complaints:
         return Verdict(found, complaints, [])
 
-    # A variable that is itself a noise has the same chains, so it passes the same limits.
+    # A variable that is itself a noise has the same chains, so the same limits apply to it.
     values = _constrained(model, data, samples)
     shape = diverging.shape
     alone = {
@@ -473,7 +475,7 @@ def _constrained(model: FunctionModel, data: Data, samples: Samples) -> dict[str
 
 
 def _used_by_plans(model: FunctionModel, data: Data, samples: Samples) -> dict[str, np.ndarray]:
-    """Return the drift in some measured bounds and the form, each (chain, draw, number)."""
+    """Return the drift in some measured bounds and the form, of shape (chain, draw, number)."""
     shape = samples.fields["diverging"].shape
     n_draws = shape[0] * shape[1]
     values = _constrained(model, data, samples)
@@ -487,7 +489,7 @@ def _used_by_plans(model: FunctionModel, data: Data, samples: Samples) -> dict[s
     for name, value in space._asdict().items():
         if value is None:
             continue
-        # A variance is judged as the sd that the user gave: R-hat differs between the two.
+        # A variance is checked as the sd that the user gave, because their R-hats differ.
         is_variance = name.endswith("_cov") and value.shape[-1] == 1
         used[name] = np.sqrt(value) if is_variance else value
     return {name: v.reshape(*shape, -1) for name, v in used.items()}
@@ -505,12 +507,13 @@ def _sampled(
     progress: bool,
     check: bool,
 ) -> tuple[Samples, Verdict]:
-    """Run NUTS until the diagnostics are good, or until it has had many draws.
+    """Run NUTS until the diagnostics are good or many draws have been taken.
 
-    Each run starts from draws of the run before. Draws of runs without divergent transitions are
-    joined, and as many as were asked for are kept, evenly spaced, or all if those are too few.
-    After a divergence, earlier draws are discarded, and steps are smaller. From the second run on,
-    a few divergences are accepted, and variables that are not identified; see `_judge`.
+    Each run starts from draws of the run before. The draws of runs without divergent transitions
+    are joined. The requested number of draws is kept, evenly spaced, or all draws if the checks
+    need more. After a divergence, earlier draws are discarded, and steps are smaller. From the
+    second run on, a few divergences and variables that are not identified are accepted; see
+    `_judge`.
 
     Returns:
         Samples, and the verdict on them.
@@ -551,7 +554,7 @@ def _sampled(
         is_last = attempt == most
         verdict = _judge(model, data, joined, patient=patient, last=is_last)
         if not verdict.complaints or is_last:
-            if not runs:  # the draws of one run are as many as were asked for
+            if not runs:  # one run has the requested number of draws
                 return joined, verdict
             few = joined.some(draws)
             of_few = _judge(model, data, few, patient=patient)
@@ -609,7 +612,7 @@ def _without_padding(values: np.ndarray, site: Site, n_missions: int) -> np.ndar
 
 
 def _padded_values(posterior: xr.DataTree, sites: Mapping[str, Site]) -> dict[str, np.ndarray]:
-    """Return draws (draw, ...) of the variables, with any values for missions of the padding."""
+    """Return draws (draw, ...) of the variables; values are arbitrary for padded missions."""
     draws = posterior["posterior"].to_dataset()
     values = {}
     for name, site in sites.items():
@@ -747,8 +750,8 @@ def _dims_of(
 ) -> dict[str, tuple[str, ...]]:
     """Return the names of the axes of variables, by name.
 
-    A plate whose name is that of an axis of posteriors, but which has another size, or whose name
-    is that of a variable, has the suffix `_plate`.
+    The suffix `_plate` is added to the name of a plate if it is the name of a variable, or that of
+    an axis of posteriors with a different size.
     """
     taken = {"chain", "draw", "bound", *map(safe, sites)}
     known: dict[str, int] = {}
