@@ -109,7 +109,7 @@ class TrustFilter:
             n_robots: Number of robots; needed only with `TrustParams`.
             family: Observation family of parameter draws; ignored for a DataTree.
             max_draws: Maximum number of draws; if there are more, evenly spaced draws are selected.
-            workspace: Workspace, whose order of robots and features applies to all arrays. By
+            workspace: Workspace that determines the order of robots and features in all arrays. By
                 default, arrays without labels are in the order of the draws.
 
         Raises:

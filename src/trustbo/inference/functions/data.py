@@ -59,7 +59,7 @@ def data_of(
         n_ticks[j, driven] = mission.n_ticks
         duration[j, driven] = mission.duration
         if mission.path:
-            path = mission.path[: len(mission.bounds) + 1]  # failed missions do not complete the path
+            path = mission.path[: len(mission.bounds) + 1]  # failed missions do not complete it
             bound[j, driven, 1:] = path[1:]
             if moves:
                 bound[j, driven] = bounds_along(path)

@@ -68,7 +68,7 @@ class FunctionDraws(Draws):
         self.robots = tuple(robots)
         self.features = tuple(features)
         self.shape = shape
-        self._numbers = np.arange(len(next(iter(self.values.values()))))  # numbers of the random keys
+        self._numbers = np.arange(len(next(iter(self.values.values()))))  # of the random keys
         self._of_mean = False
         self._is_flat = True  # whether a mean has a leading axis
         self._form: StateSpace | None = None

@@ -440,9 +440,9 @@ def _judge(
 
     Variables may differ between chains although the drift does not. An example is the weights of a
     neural network, whose units can be exchanged. Therefore, if `patient` is true and the chains of
-    the variables are bad, those of the drift and the noises are checked instead. A few divergences
-    are then accepted, too. In the `last` check, the limits for the drift and the noises are wider,
-    because plans from a rough posterior are better than plans that ignore a mission.
+    the variables are bad, those of the drift and the noises are checked instead. With `patient`, a
+    few divergences are also accepted. In the `last` check, the limits for the drift and the noises
+    are wider, because plans from a rough posterior are better than plans that ignore a mission.
     """
     diverging = samples.fields["diverging"]
     most = int(_TOLERATED * diverging.size) if patient else 0

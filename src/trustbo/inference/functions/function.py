@@ -1,4 +1,4 @@
-"""A NumPyro function as a trust model: its inputs, its densities, and what a draw computes."""
+"""A NumPyro function as a trust model: its inputs, its densities and its results for a draw."""
 
 import inspect
 import json
@@ -41,21 +41,21 @@ from trustbo.models.contact_rate import ContactRate
 from trustbo.statespace import Inputs, StateSpace
 
 KIND = "function"
-"""The entry `class` in the record of a model that is a function."""
+"""Value of the entry `class` in the record of a model that is a function."""
 _HOW = (
     'End it with numpyro.sample("contact_rate", tb.models.ContactRate(drift, beta0, delta_w, '
     "delta_v), obs=contact_rate)."
 )
 _MOST_KNOWN = 64
-"""Number of functions that are remembered, with what was compiled for them."""
+"""Number of functions that are remembered, together with their compiled code."""
 _AXES = ("chain", "draw")
 """Names that no variable may have."""
 _OF_SHAPES = re.compile("ncompatible shapes|could not be broadcast|not broadcast")
-"""Errors of JAX and NumPy about shapes that do not fit each other."""
+"""Errors that JAX and NumPy raise if shapes do not match."""
 
 
 class Found(NamedTuple):
-    """What a function computes for one draw of its variables."""
+    """Results of a function for one draw of its variables."""
 
     space: StateSpace
     inputs: Inputs
@@ -64,7 +64,7 @@ class Found(NamedTuple):
     log_likelihood: Any
     """Log density of each mission's rates, or log probability of its counts, shape (mission,)."""
     of_counts: Any
-    """Whether `log_likelihood` is of tick counts if every rate has one."""
+    """Whether `log_likelihood` refers to tick counts if every rate has one."""
 
 
 class FunctionModel:
@@ -76,15 +76,15 @@ class FunctionModel:
         function: The function.
         inputs: Names of the inputs that it takes; see `data.NAMES`.
         compiled: Methods that were compiled for draws, by name and features.
-        sampler: `nuts.Sampler` of the function, once there is one.
+        sampler: `nuts.Sampler` of the function, or None if there is none yet.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         """Read the names of the function's parameters.
 
         Raises:
-            TrustboError: If a parameter is not an input and has no default, or `awareness` or
-                `contact_rate` is not among the parameters.
+            TrustboError: If a parameter is not an input and has no default, or if the parameters
+                lack `awareness` or `contact_rate`.
         """
         self.function = function
         self.name = name_of(function)
@@ -92,8 +92,8 @@ class FunctionModel:
         self.fingerprint = fingerprint(function)
         self.compiled: dict[tuple[str, tuple[str, ...]], Callable[..., Any]] = {}
         self.sampler: Any = None
-        self._in_range: set[tuple[str, ...]] = set()  # features that were checked
-        self._runs_again = False  # whether it was checked that every run has all sites
+        self._in_range: set[tuple[str, ...]] = set()  # feature names that were checked
+        self._runs_again = False  # whether a check has found all sites in a second run
 
     @property
     def family(self) -> str:
@@ -102,7 +102,7 @@ class FunctionModel:
 
     @property
     def needs_observations(self) -> bool:
-        """Whether the function takes all data as one object, which cannot be compiled once."""
+        """Whether the function takes all data as one object, and is recompiled for new data."""
         return "observations" in self.inputs
 
     def __repr__(self) -> str:
@@ -116,7 +116,7 @@ class FunctionModel:
         return f"the function {self.name}"
 
     def record(self) -> dict[str, Any]:
-        """Return the name and a hash of the function and of its constants, for files."""
+        """Return the name and hash of the function, and the hashes of its constants, for files."""
         return {
             "class": KIND,
             "name": self.name,
@@ -126,7 +126,7 @@ class FunctionModel:
 
     @cached_property
     def text(self) -> str:
-        """The record as text, the attribute `model_record` of a posterior."""
+        """The record as text, as in the attribute `model_record` of a posterior."""
         return json.dumps(self.record())
 
     def call(self, data: Data) -> None:
@@ -137,8 +137,9 @@ class FunctionModel:
         """Return the latent variables of the function by name, without computing anything.
 
         Raises:
-            TrustboError: If the function fails, or has no site `contact_rate` with a `ContactRate`
-                of the shape of the missions, or a variable is discrete, or there is none.
+            TrustboError: If the function fails; if it has no site `contact_rate` with a
+                `ContactRate` in the shape of the missions; if a variable is discrete; or if there
+                are no variables.
         """
         trace, free = self._shapes(data)
         if not free:
@@ -149,10 +150,10 @@ class FunctionModel:
         return {name: site_of(trace[name], free[name], plates) for name in free}
 
     def computed_sites(self, data: Data) -> dict[str, Site]:
-        """Return the sites of `numpyro.deterministic` by name, without those that have bounds.
+        """Return the sites of `numpyro.deterministic` by name, except those with an axis of bounds.
 
-        The function runs, without computing anything, on twice as many missions and bounds. An axis
-        whose length then changes is that of missions or bounds.
+        The function is traced, without computing anything, on twice as many missions and bounds. An
+        axis whose length changes is the axis of missions or bounds.
         """
         trace, _ = self._shapes(data)
         names = [name for name, site in trace.items() if site["type"] == "deterministic"]
@@ -161,7 +162,7 @@ class FunctionModel:
 
         try:
             more_missions, more_bounds = (self._shapes(doubled(data, n))[0] for n in (0, 1))
-        except TrustboError:  # the function is made for this number of missions and bounds
+        except TrustboError:  # the function accepts only this number of missions and bounds
             more_missions = more_bounds = trace
         plates = plates_of_rates(trace)
         sites = {}
@@ -201,7 +202,7 @@ class FunctionModel:
     def _require_sites_again(self, found: Mapping[str, Any], key: jax.Array, data: Data) -> None:
         """Raise TrustboError if a second run lacks sites of the first one.
 
-        `jax.jit` does not run a function again that it has compiled, so NumPyro misses its sites.
+        `jax.jit` does not run a compiled function again, so NumPyro does not see its sites.
         """
         if self._runs_again:
             return
@@ -218,8 +219,9 @@ class FunctionModel:
     def _require_features_in_range(self, data: Data) -> None:
         """Raise TrustboError if the function reads a feature that awareness does not have.
 
-        JAX returns the last feature instead of an error. NumPy raises an error, so the function
-        runs once with awareness as an array of NumPy. Other errors mean that it needs one of JAX.
+        For an index out of range, JAX returns the last feature, but NumPy raises an error.
+        Therefore, the function is run once with awareness as a NumPy array. Any other error means
+        that the function needs a JAX array.
         """
         features = data["features"]
         if features in self._in_range:
@@ -277,7 +279,7 @@ class FunctionModel:
         self._require_variables(trace)
 
     def _require_contact_rate(self, rates: Any) -> ContactRate:
-        """Return the distribution of the rates; raises TrustboError unless it is a ContactRate."""
+        """Return the distribution of the rates; raise TrustboError unless it is a ContactRate."""
         if isinstance(rates, ContactRate):
             return rates
 
@@ -296,7 +298,7 @@ class FunctionModel:
         )
 
     def _require_variables(self, trace: Mapping[str, Any]) -> None:
-        """Raise TrustboError for sites of a kind or a name that a posterior cannot have."""
+        """Raise TrustboError for sites whose kind or name is not allowed in a posterior."""
         for name, one in trace.items():
             free = one["type"] == "sample" and not one["is_observed"]
             named = free or one["type"] == "deterministic"
@@ -320,17 +322,17 @@ class FunctionModel:
     # --- functions that are compiled once for each shape of their arguments ---
 
     def potential(self, z: Mapping[str, Any], data: Data) -> Any:
-        """Compute the negative log density at values z of unconstrained space."""
+        """Compute the negative log density at unconstrained values z."""
         log_p, _ = log_density(self._at(z), (data,), {}, {})
         return -log_p
 
     def constrain(self, z: Mapping[str, Any], data: Data) -> dict[str, Any]:
-        """Convert values of unconstrained space to values of the variables."""
+        """Convert unconstrained values to values of the variables."""
         trace = handlers.trace(self._at(z)).get_trace(data)
         return {name: trace[name]["value"] for name in z}
 
     def _at(self, z: Mapping[str, Any]) -> Callable[..., Any]:
-        """Return the function with values z of unconstrained space, and a factor for each Jacobian.
+        """Return the function with unconstrained values z, and with a factor for each Jacobian.
 
         `numpyro.infer.util.potential_energy` does the same with `numpyro.factor`, which fails after
         `import arviz, numpyro.distributions`; see `models.backend`.
@@ -360,7 +362,7 @@ class FunctionModel:
         return handlers.substitute(handlers.seed(self.call, 0), substitute_fn=value_of)
 
     def unconstrain(self, values: Mapping[str, Any], data: Data) -> dict[str, Any]:
-        """Convert values of the variables to values of unconstrained space."""
+        """Convert values of the variables to unconstrained values."""
         trace = self._trace(values, jax.random.key(0), data)
         return {name: biject_to(trace[name]["fn"].support).inv(v) for name, v in values.items()}
 
@@ -377,7 +379,7 @@ class FunctionModel:
         return {n: site["value"] for n, site in trace.items() if site["type"] == "deterministic"}
 
     def evaluate(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> Found:
-        """Run the function with given values of its variables; others are drawn from the prior."""
+        """Run the function with given values of some variables; draw the others from the prior."""
         trace = self._trace(values, key, data)
         rates: Any = trace[RATES]["fn"]
         return Found(
@@ -403,7 +405,7 @@ class FunctionModel:
         return handlers.trace(given).get_trace(data)
 
     def over_draws(self, method: str, n_draw_axes: int, data: Data) -> Callable[..., Any]:
-        """Return a method whose first arguments have an axis (draw,), compiled for these data.
+        """Return a method compiled for these data, with an axis (draw,) in its first arguments.
 
         Args:
             method: Name of a method whose last argument is `data`.
@@ -431,7 +433,7 @@ class FunctionModel:
         return lambda *draws: self._called(mapped, (*draws, arrays), data)
 
     def _called(self, compiled: Callable[..., Any], arguments: tuple[Any, ...], data: Data) -> Any:
-        """Call a compiled function with the settings and messages of this module."""
+        """Call a compiled function with the settings and error messages of this module."""
         with own_settings(), _explained(self, data):
             return jax.tree.map(np.asarray, compiled(*arguments))
 
@@ -469,11 +471,11 @@ class _explained:  # noqa: N801
 
 
 _KNOWN: OrderedDict[str, FunctionModel] = OrderedDict()
-"""Models of functions by fingerprint, the last used one last."""
+"""Models of functions by fingerprint, with the most recently used model last."""
 
 
 def as_model(function: Callable[..., Any] | FunctionModel) -> FunctionModel:
-    """Return the model of a function, the same one for the same function.
+    """Return the model of a function; the same function always gives the same model.
 
     Raises TrustboError if the function cannot be a model; see `FunctionModel`.
     """
@@ -495,10 +497,10 @@ def as_model(function: Callable[..., Any] | FunctionModel) -> FunctionModel:
 def model_of_record(
     record: Mapping[str, Any], given: Callable[..., Any] | FunctionModel | None = None
 ) -> FunctionModel:
-    """Return the model with a record, which must be given or have been used in this process.
+    """Return the model that a record describes, if it is given or was used in this process.
 
     Raises:
-        TrustboError: If the function is not known, or another one is given.
+        TrustboError: If the function is not known, or if a different one is given.
     """
     if given is not None:
         model = as_model(given)
@@ -521,7 +523,7 @@ def model_of_record(
 
 
 def _difference(model: FunctionModel, record: Mapping[str, Any]) -> str:
-    """Say which constants of a function are others than in a record, or that the code is."""
+    """State which constants of a function differ from those in a record, or that the code does."""
     if model.name != record["name"]:
         return ""
 
@@ -535,12 +537,12 @@ def _difference(model: FunctionModel, record: Mapping[str, Any]) -> str:
 
 
 def is_of_function(record: Mapping[str, Any]) -> bool:
-    """Return whether a record is of a model that is a function."""
+    """Return whether a record describes a model that is a function."""
     return record["class"] == KIND
 
 
 def _inputs_of(function: Callable[..., Any], name: str) -> tuple[str, ...]:
-    """Return the names of a function's inputs; raises TrustboError if they are wrong."""
+    """Return the names of a function's inputs; raise TrustboError if they are wrong."""
     inner: Any = function
     while isinstance(inner, Messenger):  # such as `handlers.reparam`
         inner = inner.fn

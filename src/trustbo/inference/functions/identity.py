@@ -1,4 +1,4 @@
-"""What identifies a function in files: its name, and a hash of its code and of its constants."""
+"""Identity of a function in files: its name, and hashes of its code and its constants."""
 
 import ast
 import functools
@@ -26,7 +26,7 @@ _HASH_LENGTH = 16
 
 
 def name_of(function: Any) -> str:
-    """Return the name of a function, also of one in `functools.partial` or a handler."""
+    """Return the name of a function, which may be wrapped by `functools.partial` or a handler."""
     if isinstance(function, functools.partial) and not hasattr(function, "__name__"):
         return name_of(function.func)
     if isinstance(function, Messenger) and function.fn is not None:
@@ -35,7 +35,7 @@ def name_of(function: Any) -> str:
 
 
 def fingerprint(function: Callable[..., Any]) -> str:
-    """Return a hash of a function: its code, without comments, and the values that it refers to.
+    """Return a hash of a function's code, without comments, and of the values it refers to.
 
     Values are defaults, variables of enclosing functions, and global variables. Modules, classes,
     and functions of other modules are identified by their names alone.
@@ -49,8 +49,8 @@ def fingerprint(function: Callable[..., Any]) -> str:
 def constants_of(function: Callable[..., Any]) -> dict[str, str]:
     """Return a short hash of each value that a function refers to, by name; see `fingerprint`.
 
-    These are arguments of `functools.partial`, defaults, variables of enclosing functions, and
-    global variables, also of functions of the same module that are called.
+    These values are arguments of `functools.partial`, defaults, variables of enclosing functions
+    and global variables. Those of called functions of the same module are included.
     """
     found: dict[str, str] = {}
     _add_constants(function, found, set())
@@ -58,7 +58,7 @@ def constants_of(function: Callable[..., Any]) -> dict[str, str]:
 
 
 def _add_constants(function: Any, found: dict[str, str], seen: set[int]) -> None:
-    """Add the values that a function refers to; `seen` has the identities of earlier functions."""
+    """Add the values that a function refers to; `seen` contains the ids of earlier functions."""
     if id(function) in seen:
         return
     seen.add(id(function))
@@ -103,7 +103,7 @@ def _values_of(function: Any) -> dict[str, Any]:
 
 
 def _describe(value: Any, parts: list[str], seen: dict[int, int]) -> None:
-    """Add texts to `parts` that tell a value from others; `seen` numbers the functions so far."""
+    """Add texts that identify a value to `parts`; `seen` numbers the functions so far."""
     if isinstance(value, TrustModel):
         parts.append(json.dumps(model_to_record(value), sort_keys=True))
     elif inspect.ismethod(value):
@@ -140,7 +140,7 @@ def _describe_function(
     function: Callable[..., Any], parts: list[str], seen: dict[int, int]
 ) -> None:
     """Describe the code of a function and the values that it refers to."""
-    if id(function) in seen:  # a recursive function, or one that is used twice
+    if id(function) in seen:  # a recursive function, or a function that is used twice
         parts.append(f"function {seen[id(function)]}")
         return
 
@@ -202,7 +202,7 @@ def _describe_object(value: Any, parts: list[str], seen: dict[int, int]) -> None
 
 
 def _describe_other(value: Any, parts: list[str], seen: dict[int, int]) -> None:
-    """Describe a value that can be pickled; others are told apart by their kinds only.
+    """Describe a value that can be pickled; other values are identified only by their kinds.
 
     Pickle refers to the class of an object by name, so the code of `__call__` is added.
     """
@@ -219,13 +219,13 @@ def _describe_other(value: Any, parts: list[str], seen: dict[int, int]) -> None:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickler that stores sets in the order of their items' texts.
+    """Pickler that stores the items of a set in the order of their texts.
 
-    The order of texts in a set differs between processes.
+    The order of strings in a set differs between processes.
     """
 
     def persistent_id(self, value: Any) -> Any:
-        """Return what stands for a set; None for other values."""
+        """Return the replacement of a set; None for other values."""
         return _sorted_texts(value) if isinstance(value, set | frozenset) else None
 
 
@@ -254,13 +254,13 @@ def _code_of(function: Callable[..., Any]) -> str:
 
 
 def _byte_code_of(code: CodeType) -> str:
-    """Return a byte code as text, the same in other processes."""
+    """Return a byte code as text, which is the same in all processes."""
     constants = [_constant(one) for one in code.co_consts]
     return f"{code.co_code.hex()} {constants} {code.co_names!r}"
 
 
 def _constant(value: Any) -> str:
-    """Return a constant of a byte code as text, the same in other processes."""
+    """Return a constant of a byte code as text, which is the same in all processes."""
     if isinstance(value, CodeType):
         return _byte_code_of(value)
     if isinstance(value, tuple):

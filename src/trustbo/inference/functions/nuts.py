@@ -1,8 +1,8 @@
-"""Sampling of a model that is a NumPyro function with NUTS, compiled once for each shape of data.
+"""Sampling of a NumPyro function with NUTS, compiled once for each shape of data.
 
 The data, the starts of the chains, the step size and the mass matrix are arguments of the compiled
-function, so a campaign that fits after each mission compiles it only when the padded data grow.
-Chains start from draws of the previous posterior, if there is one.
+function. A campaign, which fits after each mission, therefore compiles it again only when the
+padded data grow. Chains start from draws of the previous posterior, if there is one.
 """
 
 import threading
@@ -25,17 +25,17 @@ from trustbo.inference.functions.sites import Site
 from trustbo.models.backend import own_settings
 
 _CANDIDATES = 16
-"""Points from which the start of a chain is chosen, that of the largest density."""
+"""Number of candidates for the start of a chain; the one with the largest density is chosen."""
 _RADIUS = 2.0
 """Candidates are uniform in (-2, 2) in unconstrained space, as in Stan and NumPyro."""
 _FIRST_STEP = 0.1
-"""Step size at which warm-up starts without a previous posterior."""
+"""Initial step size of the warm-up if there is no previous posterior."""
 _MOST_DENSE = 50
-"""Most coordinates for which the mass matrix is dense."""
+"""Largest number of coordinates for which the mass matrix is dense."""
 _RIDGE = 1e-3
-"""Share of the variances that is added to the covariance of a previous posterior."""
+"""Fraction of the variances that is added to the covariance of a previous posterior."""
 _DEPTH = 7
-"""Most doublings of a trajectory, after which it has 127 steps."""
+"""Largest number of doublings of a trajectory, which then has 127 steps."""
 _FIELDS = ("num_steps", "diverging", "accept_prob", "energy", "potential_energy")
 
 
@@ -100,13 +100,13 @@ class Sampler:
         Args:
             data: Padded data.
             sites: Variables of the function for these data.
-            start: Where the chains start, how large steps are at first, and the mass matrix.
+            start: Starts of the chains, initial step size and mass matrix.
             warmup: Number of draws per chain that tune the kernel and are discarded.
             draws: Number of draws per chain.
             accept: Target of the acceptance probability.
             seed: Random seed.
-            progress: Whether to show the seconds after 5 seconds.
-            title: What to show before them.
+            progress: Whether to show the elapsed seconds, after 5 seconds.
+            title: Text to show before the elapsed seconds.
 
         Raises:
             TrustboError: If no candidate has a finite density.
@@ -183,7 +183,7 @@ class Sampler:
             return x[warmup:], kept, last.adapt_state.step_size
 
         run = jax.jit(jax.vmap(chain, in_axes=(0, 0, None, None, None, None)))
-        if fixed is not None:  # forget what was compiled for the data of earlier fits
+        if fixed is not None:  # drop the code that was compiled for the data of earlier fits
             for key in [key for key in self._compiled if key[-1] != fixed]:
                 self._compiled.pop(key, None)
         self._compiled[known] = run
@@ -192,7 +192,7 @@ class Sampler:
 
 @contextmanager
 def ticking(bar: Any) -> Iterator[None]:
-    """Count seconds in a progress bar while the block runs, as compiled code reports nothing."""
+    """Count seconds in a progress bar while the block runs; compiled code reports no progress."""
     done = threading.Event()
 
     def tick() -> None:

@@ -1,4 +1,4 @@
-"""Sites of a NumPyro function: their axes, which of them run over missions, and their sizes."""
+"""Sites of a NumPyro function, with their axes (some run over missions) and sizes."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -8,7 +8,7 @@ import numpy as np
 from trustbo.inference.functions.data import RATES, Data, arrays_of, observations_of
 
 _FROM_REPARAM = ("_decentered", "_base")
-"""Suffixes of the latent variable to which a reparametrisation of NumPyro moves the plates."""
+"""Suffixes of the latent variables to which NumPyro's reparametrisations move the plates."""
 _MODULE = "$params"
 """Suffix of the site with the initial weights of a neural network in `numpyro.contrib.module`."""
 
@@ -22,7 +22,7 @@ class Site(NamedTuple):
     """Axis that runs over missions; None if the variable is common to all missions."""
     shape: tuple[int, ...]
     n_free: int
-    """Number of its coordinates in unconstrained space; 0 if it is no latent variable."""
+    """Number of its coordinates in unconstrained space; 0 if it is not a latent variable."""
 
 
 def latent_in(trace: Mapping[str, Any]) -> list[str]:
@@ -35,7 +35,7 @@ def latent_in(trace: Mapping[str, Any]) -> list[str]:
 def has_prior(name: str, trace: Mapping[str, Any]) -> bool:
     """Return whether a parameter holds the initial weights of a network whose weights are sampled.
 
-    This is the case for `numpyro.contrib.module.random_flax_module` and its like.
+    Such parameters come from `numpyro.contrib.module.random_flax_module` and similar functions.
     """
     network = name.removesuffix(_MODULE)
     return network != name and any(one.startswith(f"{network}/") for one in latent_in(trace))
@@ -55,8 +55,8 @@ def computed_site(
 ) -> Site:
     """Describe a site of `numpyro.deterministic`; `mission_axis` is that of all missions, if known.
 
-    NumPyro does not know how many of its axes belong to an event. The fewest for which the plates
-    have the right sizes are assumed.
+    NumPyro does not know how many axes of such a site belong to an event. The smallest number for
+    which the plates have the right sizes is assumed.
     """
     shape = np.shape(trace[name]["value"])
     stacks = [trace.get(f"{name}{suffix}", {}) for suffix in ("", *_FROM_REPARAM)]
