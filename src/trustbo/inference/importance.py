@@ -3,16 +3,15 @@
 Hyperparameters are sampled as *scores* z, which are standard normal a priori. All other variables
 (coefficients, effects, trust) are integrated out of the density and drawn given the scores.
 
-1. `climb` searches for a mode from each start, and `fit_mode` fits a skewed Student-t there by
-   finite differences.
-2. Each round draws points from the current proposal, from the fits at the modes if there are
-   several modes, and from a defensive proposal, which covers regions that other proposals miss. All
-   proposals so far form a mixture q, and every point has the weight p(z) / q(z).
-3. A skewed Student-t is fitted to the weighted points for the next round. While few points are
-   effective, the fit stays near the first proposal. If k-hat is bad after the second round, half of
-   the points are drawn from kernels at points drawn by weight (West 1993) from then on, because
-   kernels also describe curved densities. Sampling stops when k-hat and the effective number of
-   points are good.
+1. `climb` searches for a mode from each start, and `fit_mode` fits a skewed Student-t at the mode
+   by finite differences. 2. Each round draws points from the current proposal, from the fits at the
+   modes if there are several modes, and from a defensive proposal, which covers regions that other
+   proposals miss. All proposals so far form a mixture q, and every point has the weight p(z) /
+   q(z). 3. A skewed Student-t is fitted to the weighted points for the next round. As long as few
+   points are effective, the fit stays near the first proposal. If k-hat is bad after the second
+   round, half of the points of all later rounds are drawn from kernels (West 1993), because kernels
+   can also describe curved densities. The kernels are centred at points drawn by weight. Sampling
+   stops when k-hat and the effective number of points are good.
 
 The weights are Pareto-smoothed (Vehtari, Simpson, Gelman, Yao and Gabry 2024). The mean weight
 before smoothing is an estimate of the evidence.
@@ -44,51 +43,51 @@ _KERNELS = 16
 _KERNEL_SCALE = 0.7
 """Scale of a kernel relative to that of all points."""
 _DEFENSIVE = 8
-"""Points of other proposals per defensive point after the first round."""
+"""Number of points from other proposals per defensive point after the first round."""
 _EFFICIENCY = 0.6
-"""Effective points expected per point, to choose the size of the last rounds."""
+"""Expected number of effective points per point, used to choose the size of the last rounds."""
 _LEAST_ROUND = 4
 """Smallest round, as a divisor of the usual number of points."""
 _PER_AXIS = 4.0
-"""Effective points per dimension needed to estimate moments."""
+"""Number of effective points per dimension that is needed to estimate moments."""
 _FLATTENED = 6
-"""Most times that uneven weights are replaced by their square roots."""
+"""Largest number of times that uneven weights are replaced by their square roots."""
 _SLOPE_STEP = 1e-3
-"""Step of the finite differences of slopes."""
+"""Step of the finite differences for slopes."""
 _CURVATURE_STEP = 3e-2
-"""Step of the finite differences of the curvature at a mode."""
+"""Step of the finite differences for the curvature at a mode."""
 _WIDTH_STEP = 0.1
-"""Step of the finite differences of curvatures at the start of a search."""
+"""Step of the finite differences for curvatures at the start of a search."""
 _CURVATURES = (0.5, 1e4)
 """Limits of the curvatures at the start of a search."""
 _N_STEPS = 40
-"""Most steps of a search for a mode."""
+"""Largest number of steps of a search for a mode."""
 _CLOSE = 0.1
 """A search for a mode ends when a step gains less than this log density."""
 _LARGEST_COST = 1e10
-"""Replaces an infinite -log density, which a search or a finite difference cannot use."""
+"""Replacement for an infinite -log density, which searches and finite differences cannot use."""
 _LEAST_CURVATURE = 0.3
-"""Least curvature of -log density at a mode; the prior has curvature 1."""
+"""Smallest curvature of -log density at a mode; the prior has curvature 1."""
 _LEAST_DROP = 1e-3
-"""Least drop of the log density that gives the width of a side."""
+"""Smallest drop of the log density from which the width of a side is computed."""
 _APART = 1.0
-"""Distance in sds at which two modes are distinct."""
+"""Distance in sds from which two modes count as distinct."""
 _NEGLIGIBLE = 8.0
-"""Log density below the highest mode at which a mode is left out."""
+"""Modes whose log density is this much below that of the highest mode are left out."""
 _SKEW_STEP = 2.0
-"""Where skewness is measured, in sds."""
+"""Distance from the mode at which skewness is measured, in sds."""
 _SKEWS = (0.3, 3.0)
-"""Limits of the width of a side relative to that of both."""
+"""Limits of the width of one side relative to that of both sides."""
 _SHIFTS = np.linspace(-1.5, 1.5, 31)
-"""Differences that are tried of a center and the mean, in sds."""
+"""Differences between the center and the mean that are tried, in sds."""
 _FARTHEST = 7.0
 """Largest absolute score of a mode."""
 _EDGE = 1e-12
-"""Least distance of uniform numbers from 0 and 1, at which quantiles are infinite."""
+"""Smallest distance of uniform numbers from 0 and 1, where quantiles are infinite."""
 _EVEN = 1e-6
 """Range of log ratios within which weights count as equal."""
 _BELOW_ALL = 100.0
-"""Log ratio of points without density, relative to the smallest that is finite."""
+"""Distance of the log ratio of points without density below the smallest finite log ratio."""
 
 LogDensity = Callable[[np.ndarray], np.ndarray]
 """Log density (point,) of scores (point, score) up to a constant; -inf for zero density."""
@@ -110,7 +109,7 @@ class Student(NamedTuple):
     def from_points(cls, z: np.ndarray, weight: np.ndarray, near: Self) -> Self:
         """Fit points z (point, score) with weights (point,) that sum to 1.
 
-        A covariance has many elements, so it is averaged with the covariance of `near`, which
+        Since a covariance has many elements, it is averaged with the covariance of `near`, which
         counts as one point for each element. The sides are fitted by `two_piece`.
         """
         d = z.shape[1]
@@ -128,7 +127,7 @@ class Student(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The distribution as JSON, from which `from_text` makes exactly the same one."""
+        """The distribution as JSON, from which `from_text` restores it exactly."""
         return json.dumps([array.tolist() for array in self])
 
     @classmethod
@@ -205,7 +204,7 @@ class Points(NamedTuple):
         weight: Pareto-smoothed weights with sum 1, shape (point,).
         k_hat: Pareto shape of the weights, which is good below 0.5 and bad above 0.7.
         log_evidence: Log of the integral of the density.
-        near: Proposal that `proposal` resembles if few points are effective.
+        near: Proposal to which `proposal` is close if few points are effective.
     """
 
     z: np.ndarray
@@ -244,7 +243,7 @@ class Points(NamedTuple):
         """Draw indices of `n` equally weighted points.
 
         Points are in random order, but repetitions of a point are next to each other. Therefore,
-        the effective sample size that ArviZ computes from autocorrelations is about `kish`.
+        the effective sample size that ArviZ computes from autocorrelations is close to `kish`.
         """
         order = rng.permutation(len(self.z))
         return order[systematic(self.weight[order], n, rng)]
@@ -273,11 +272,12 @@ def sample(
         enough: Effective number of points at which sampling stops if k-hat is good.
         most: Maximum number of rounds.
         defensive: Function that returns a proposal for regions that the current proposal may miss;
-            by default a Student-t slightly wider than the prior.
-        first: First proposal, such as that of a similar posterior; by default fitted at the modes
-            that the search finds. With `first`, the first round is like later rounds.
-        visit: Log density of the drawn points, in the order of `Points.z`, if something has to be
-            recorded with each point; by default `log_density`.
+            the default is a Student-t slightly wider than the prior.
+        first: First proposal, such as that of a similar posterior. By default, proposals are fitted
+            at the modes that the search finds. With `first`, the first round is like the later
+            rounds.
+        visit: Log density of the drawn points, in the order of `Points.z`, for callers that record
+            something with each point; by default `log_density`.
     """
     d = starts.shape[1]
     prior = Student(np.zeros(d), _PRIOR_SCALE * np.eye(d))
@@ -301,7 +301,7 @@ def sample(
     uneven = False
     n_rounds = 0
     while True:
-        # Step 2: draw points, and weigh all points so far by the mixture of all proposals so far.
+        # Step 2: draw points, and weight all points so far by the mixture of all proposals so far.
         n_rounds += 1
         others = defensive(current) if defensive else prior
         for density, n in [*own, (others, n_others)]:
@@ -319,7 +319,8 @@ def sample(
         if (good and points.kish > enough and n_rounds > 1) or n_rounds == most:
             return points
 
-        # Step 3: fit the proposal of the next round, which is as large as the missing points need.
+        # Step 3: fit the proposal of the next round, whose size depends on how many points are
+        # missing.
         current = points.proposal
         uneven = uneven or (not good and n_rounds > 1)
         if uneven:
@@ -341,7 +342,7 @@ def _shares(densities: list[Student], n: int) -> list[tuple[Student, int]]:
 
 
 def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
-    """Fit proposals at the distinct modes reached from the starts, with the highest mode first."""
+    """Fit proposals at the distinct modes reached from the starts; the highest mode comes first."""
     found: list[tuple[float, Student]] = []
     for start in starts:
         mode = fit_mode(log_density, climb(log_density, start))
@@ -359,9 +360,10 @@ def find_modes(log_density: LogDensity, starts: np.ndarray) -> list[Student]:
 
 
 def climb(log_density: LogDensity, start: np.ndarray) -> np.ndarray:
-    """Search for a mode (score,) by L-BFGS with derivatives from finite differences.
+    """Search for a mode by L-BFGS, with derivatives from finite differences.
 
-    The scores are divided by their widths at the start, so that the first steps are short enough.
+    Returns the mode as an array of shape (score,). The scores are divided by their widths at the
+    start to keep the first steps short.
     """
     d = len(start)
     axes = np.eye(d)
@@ -385,7 +387,7 @@ def climb(log_density: LogDensity, start: np.ndarray) -> np.ndarray:
 
 
 def fit_mode(log_density: LogDensity, mode: np.ndarray) -> Student:
-    """Fit a Student-t at a mode, with the curvature there and separate widths on the two sides.
+    """Fit a Student-t at a mode, with the curvature at the mode and a separate width on each side.
 
     A split Student-t fits skewed posteriors (Geweke 1989, Econometrica 57).
     """
@@ -396,7 +398,7 @@ def fit_mode(log_density: LogDensity, mode: np.ndarray) -> Student:
     f = _finite(log_density(mode + _CURVATURE_STEP * steps))
     up, down, both = f[1 : d + 1], f[d + 1 : 2 * d + 1], f[2 * d + 1 :]
 
-    # Second differences; flat or rising directions get the least curvature.
+    # Second differences; flat or rising directions get the smallest curvature.
     hessian = np.diag(up - 2.0 * f[0] + down)
     hessian[i, j] = hessian[j, i] = both - up[i] - up[j] + f[0]
     curvature, vectors = np.linalg.eigh(-hessian / _CURVATURE_STEP**2)
@@ -420,7 +422,7 @@ def smoothed(log_ratio: np.ndarray, relative: float = 1.0) -> tuple[np.ndarray, 
     Args:
         log_ratio: Log importance ratios.
         relative: Effective number of points relative to the number of points, below 1 for draws of
-            a Markov chain; the tail has more points if it is small.
+            a Markov chain. The smaller it is, the more points the tail has.
 
     Returns:
         Weights that sum to 1, k-hat, and the log of the mean ratio.
@@ -430,7 +432,8 @@ def smoothed(log_ratio: np.ndarray, relative: float = 1.0) -> tuple[np.ndarray, 
     if finite.all() and np.ptp(log_ratio) < _EVEN:  # equal weights have no tail
         return np.full(len(log_ratio), 1.0 / len(log_ratio)), -np.inf, log_mean
 
-    # Vehtari et al. (2024) in ArviZ, which takes log likelihoods, with the opposite sign.
+    # Vehtari et al. (2024), as implemented in ArviZ, which takes log likelihoods: the sign is the
+    # opposite.
     kept = np.where(finite, log_ratio, log_ratio[finite].min() - _BELOW_ALL)
     log_weight, k_hat = array_stats.psislw(-kept, r_eff=relative)  # pyright: ignore[reportArgumentType]
     k_hat = float(np.nan_to_num(k_hat, nan=np.inf))

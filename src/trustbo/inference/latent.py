@@ -39,7 +39,7 @@ def latent_of(
         rng: Random number generator.
     """
     rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
-    _, some, index = np.unique(  # EP draws may repeat, so evaluate each distinct draw once
+    _, some, index = np.unique(  # EP draws may repeat, so each distinct draw is evaluated once
         np.column_stack([*rows, draws.c]), axis=0, return_index=True, return_inverse=True
     )
     index = index.ravel()
@@ -82,7 +82,7 @@ def replicate(density: Density, draws: JointDraws, rng: np.random.Generator) -> 
 def predictors(
     density: Density, draws: JointDraws
 ) -> Iterator[tuple[slice, Theta, LinearPredictor, np.ndarray]]:
-    """Yield the slice, theta, predictors and mean predictors of each chunk of draws."""
+    """Yield the slice, theta, linear predictors and their means for each chunk of draws."""
     for where, theta in chunks(draws.theta):
         density.evaluated(len(theta["inverse_gain"]))
         predictor = density.model.linear_predictor(theta, density.observations, density.layout)
@@ -96,7 +96,7 @@ def _exact_trust(
     mean: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw trust given Gaussian rates; also return log-likelihoods (draw, block)."""
+    """Draw trust given Gaussian rates; return trust and log-likelihoods (draw, block)."""
     b = density.blocks
     S = each(predictor.trust_cov, b.label)
     W, log_sites = whiten(b, predictor, density.site_precision(predictor))
@@ -118,11 +118,11 @@ def _ep_trust(
     mean: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw trust given non-Gaussian rates by weighted particles; returns as `_exact_trust`."""
+    """Draw trust given non-Gaussian rates by weighted particles; see `_exact_trust`."""
     joint = ep.Joint(density.blocks, predictor, density.prior(theta), density.rates)
     _, sites = ep.log_evidence(joint, density.sites, SWEEPS)
 
-    # Particles of the predictor f; the Gumbel noise chooses one by weight, for each block.
+    # Draw particles of the predictor f; for each block, Gumbel noise chooses one by weight.
     drawn = [ep.draw_predictors(joint, mean, sites, rng) for _ in range(_PARTICLES)]
     f, log_w = (np.stack(part) for part in zip(*drawn, strict=True))
     chosen = np.argmax(log_w + rng.gumbel(size=log_w.shape), axis=0)

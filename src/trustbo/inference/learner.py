@@ -1,4 +1,4 @@
-"""Models as campaigns use them: what is learned from missions, and draws for planning.
+"""Models as campaigns use them: fitting to missions, and draws for planning.
 
 A model is a `TrustModel` or a NumPyro function. Both become a `Learner`, so that only this module
 distinguishes them.
@@ -51,18 +51,18 @@ Model = TrustModel | Callable[..., Any]
 """A trust model: an object of a model class, or a NumPyro function."""
 
 _N_DRAWS = 1000
-"""Posterior draws of the parameters per chain."""
+"""Number of posterior draws of the parameters per chain."""
 _N_PLACE_DRAWS = 250
-"""The same with place effects, whose draws are large, from the importance sampler."""
+"""Number of draws from the importance sampler with place effects, whose draws are large."""
 _N_MEAN = 500
-"""Prior draws of a function that are averaged for the first plan."""
+"""Number of prior draws of a function that are averaged for the first plan."""
 
 
 class Learner(Protocol):
-    """A model that learns from missions, and whose draws make plans."""
+    """A model that learns from missions and whose draws are used to plan."""
 
     samplers: ClassVar[tuple[str, ...]]
-    """Names of the samplers of the posterior, the default first."""
+    """Names of the available samplers, the default first."""
     model: Any
     """The model."""
 
@@ -76,7 +76,7 @@ class Learner(Protocol):
         ...
 
     def record(self) -> dict[str, Any]:
-        """Return what identifies the model in files, as plain values."""
+        """Return plain values that identify the model in files."""
         ...
 
     def fit(
@@ -130,7 +130,7 @@ class Learner(Protocol):
 
 
 class ClassLearner:
-    """Learner of a model class; the model is None if it is custom and was read from files."""
+    """Learner of a model class; the model is None if it is custom and was read from a file."""
 
     samplers: ClassVar[tuple[str, ...]] = SAMPLERS
 
@@ -169,7 +169,7 @@ class ClassLearner:
         **options: Any,
     ) -> xr.DataTree:
         """See `Learner.fit`."""
-        # Importance draws are independent, so fewer suffice than of a chain.
+        # Importance draws are independent, so fewer are needed than from a Markov chain.
         has_places = any(isinstance(effect, PlaceEffect) for effect in self._known.effects)
         few = sampler == "importance" and has_places
         options = {"draws": _N_PLACE_DRAWS if few else _N_DRAWS} | options
@@ -289,7 +289,7 @@ class FunctionLearner:
     def draws(
         self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False
     ) -> Draws:
-        """See `Learner.draws`; variables of one mission are always drawn for the next one."""
+        """See `Learner.draws`; variables of single missions are always drawn for the next one."""
         return draws_of_function(self.model, posterior, workspace)
 
     def expected_and_drawn(
@@ -304,7 +304,7 @@ class FunctionLearner:
         return prior_draws_of_function(self.model, n_draws, seed, workspace)
 
     def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> FunctionDraws:
-        """See `Learner.prior_draws_ahead`; variables of one mission are always drawn."""
+        """See `Learner.prior_draws_ahead`; the variables of single missions are always drawn."""
         return self.prior_draws(n_draws, seed, workspace)
 
     def prior_mean(self, workspace: Workspace) -> Draws:
@@ -313,10 +313,10 @@ class FunctionLearner:
 
 
 def learner_of(model: Model | FunctionModel | None, workspace: Workspace) -> Learner:
-    """Return the learner of a model, by default of the default model, for a workspace.
+    """Return the learner of a model for a workspace; the default is that of the default model.
 
     Raises:
-        TrustboError: If it is neither a trust model nor a NumPyro function, or it cannot plan.
+        TrustboError: If the model is neither a trust model nor a NumPyro function, or cannot plan.
     """
     if model is None:
         return ClassLearner(default_model())
@@ -339,7 +339,7 @@ def learner_from_record(record: dict[str, Any], given: Model | None = None) -> L
     """Return the learner of a model with this record.
 
     Raises:
-        TrustboError: If the model is custom and not given, or another one is given.
+        TrustboError: If the model is custom and is not given, or if a different model is given.
     """
     if is_of_function(record):
         if isinstance(given, TrustModel):
@@ -373,23 +373,22 @@ def params_of(
 
     Args:
         posterior: DataTree from `fit`.
-        workspace: Workspace for planning; features and robots are reordered to match the workspace.
+        workspace: Workspace for planning; features and robots are reordered to match it.
         next_mission: Whether to draw the robot effects of the next mission, including their
-            persistent part, and to include the effects of robots in bounds, for bands and
-            predictions. By default, expected effects are used, as planning needs: those of robots
-            in bounds are 0 on average over the team.
+            persistent part, and to include the effects of robots in bounds. Use True for bands and
+            predictions. By default, expected effects are used, as in planning. The effects of
+            robots in bounds are then left out, because they are 0 on average over the team.
         model: Model of the posterior; needed only for a NumPyro function that was not used before
             in this process.
 
     Returns:
         `TrustParams`, `RobotParams` or `CoupledParams`, depending on the model. A pooled model with
-        robot effects gives `RobotParams` for the next mission, in which the line-of-sight weights
-        include each robot's persistent effect, decayed by one mission. A function gives
-        `FunctionDraws`.
+        robot effects gives `RobotParams` for the next mission. Their line-of-sight weights include
+        each robot's persistent effect, decayed by one mission. A function gives `FunctionDraws`.
 
     Raises:
         TrustboError: If the posterior is not from `fit`; a variable is missing or has NaN draws; or
-            features or robots differ from those of the workspace.
+            the features or robots differ from those of the workspace.
 
     Example:
         >>> params = tb.inference.params_of(posterior, workspace)  # leading axis (draw,)
@@ -419,8 +418,8 @@ def add_latent(
 ) -> xr.DataTree:
     """Add latent trust, log-likelihoods and predictions to a posterior.
 
-    A campaign stores only the parameters of its posteriors because the other groups grow with the
-    number of missions. The other groups can be computed at any time with the same result.
+    A campaign stores only the parameters of its posteriors, because the other groups grow with the
+    number of missions. These groups can be computed at any time, always with the same result.
 
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`.

@@ -5,10 +5,11 @@ Draws of the posterior get importance weights 1 / p(y_j | theta, y_-j) for leavi
 
     p(y_j | y_-j) = 1 / E[ 1 / p(y_j | theta, y_-j) | y ].
 
-For a model class, coefficients, effects and trust are integrated out, theta are the hyperparameters
-alone, and p(y_j | theta, y_-j) is the ratio of the evidence with and without mission j. If
-coefficients were not integrated out, the weights would be poor for bounds that occur only in
-mission j. For a NumPyro function, theta are all variables, and p(y_j | theta) is the likelihood.
+For a model class, theta contains only the hyperparameters, because coefficients, effects and trust
+are integrated out. p(y_j | theta, y_-j) is then the ratio of the evidence with and without mission
+j. If coefficients were not integrated out, the weights would be poor for bounds that occur only in
+mission j. For a NumPyro function, theta contains all variables, and p(y_j | theta) is the
+likelihood.
 """
 
 from collections.abc import Callable
@@ -35,25 +36,26 @@ from trustbo.models.observations import Observations
 from trustbo.parallel import computing
 
 LIKELIHOOD_OF = "log_likelihood_of"
-"""Attribute of a posterior that says what its log-likelihoods are of."""
+"""Attribute of a posterior that states what its log-likelihoods refer to."""
 TICKS = "ticks"
-"""Its value for log probabilities of tick counts."""
+"""Value of this attribute for log probabilities of tick counts."""
 RATES = "contact_rate"
-"""Its value for log densities of rates, and the name of the rates."""
+"""Value of this attribute for log densities of rates; also the name of the rates."""
 _POINTS = 500
 """Maximum number of distinct hyperparameter draws that are used."""
 _N_REFIT = 1000
-"""Number of draws of a refit without a mission, for a function per chain."""
+"""Number of draws of a refit without a mission; for a function, the number per chain."""
 _CHAINS = 4
 """Number of chains of a refit of a function."""
 _FEWEST = 4
-"""Number of missions below which each is left out by a refit, as weights are then optimistic."""
+"""Number of missions below which each one is left out by a refit, because weights would be
+optimistic."""
 _LEAST_EFFECTIVE = 2.0
-"""Least effective number of draws in the limit of k-hat."""
+"""Smallest effective number of draws that is used to compute the limit of k-hat."""
 
 
 class LeftOut(NamedTuple):
-    """What is needed to leave out each mission of a posterior."""
+    """Data that are needed to leave out each mission of a posterior."""
 
     contact_rate: np.ndarray
     """Rates (mission, bound, robot)."""
@@ -72,7 +74,8 @@ class LeftOut(NamedTuple):
     efficiency: float
     """Effective draws per draw of a Markov chain; 1 for independent draws."""
     refit: Callable[[int], tuple[float, float]] | None
-    """Log p(y_j | y_-j) by a fit without mission j, and its k-hat; None if it cannot be fitted."""
+    """Function that returns log p(y_j | y_-j) and its k-hat from a fit without mission j, or None
+    if refits are not possible."""
 
 
 @computing()
@@ -80,19 +83,19 @@ def loo(posterior: xr.DataTree, *, model: Model | None = None, progress: bool = 
     """Estimate the log predictive density of each mission given all other missions.
 
     Posterior draws get Pareto-smoothed weights. For a model class, all variables except
-    hyperparameters are integrated out, by expectation propagation if rates are not Gaussian. If
+    hyperparameters are integrated out, by expectation propagation if rates are not Gaussian. If the
     k-hat of a mission exceeds min(1 - 1 / log10(S), 0.7) for S effective draws (Vehtari et al.
     2024), or if there are fewer than four missions, the model is refitted without that mission.
     Missions without measured rates are excluded.
 
-    With few missions, the sum `elpd` is uncertain whatever k-hat is; see `compare`. `p`, the
+    With few missions, the sum `elpd` is uncertain even if k-hat is good; see `compare`. `p`, the
     effective number of parameters, should be much smaller than `n_data_points`, the number of
     missions.
 
     Args:
-        posterior: DataTree from `fit` that includes the data; or a DataTree from
-            `arviz.from_numpyro` with the attribute `log_likelihood_of` (see `compare`), whose
-            missions cannot be left out by refits.
+        posterior: DataTree from `fit` that includes the data, or a DataTree from
+            `arviz.from_numpyro` with the attribute `log_likelihood_of` (see `compare`). The latter
+            cannot be refitted.
         model: Model of the posterior; needed if the priors are custom, or if it is a NumPyro
             function that was not used before in this process.
         progress: Whether to show a progress bar after 5 seconds.
@@ -100,13 +103,13 @@ def loo(posterior: xr.DataTree, *, model: Model | None = None, progress: bool = 
     Returns:
         Pointwise `ELPDData` of ArviZ for `az.compare({name: loo(posterior), ...})`. The coordinate
         `refitted` (mission,) of `elpd_i` and `pareto_k` marks refitted missions, for which
-        `pareto_k` is the k-hat of the refit. The attribute `log_likelihood_of` of `elpd_i` says
-        whether the densities are of tick counts; only then are they comparable between observation
-        families.
+        `pareto_k` is the k-hat of the refit. The attribute `log_likelihood_of` of `elpd_i` states
+        whether the densities refer to tick counts; only then are they comparable between
+        observation families.
 
     Raises:
-        TrustboError: If fewer than two missions have measured rates, or a DataTree that is not from
-            `fit` cannot be evaluated.
+        TrustboError: If fewer than two missions have measured rates, or if a DataTree that is not
+            from `fit` cannot be evaluated.
 
     Example:
         >>> elpd = tb.inference.loo(posterior)
@@ -186,7 +189,7 @@ def good_khat(n_effective: float) -> float:
 
 
 def _no_refit(mission: int, k_hat: float, limit: float, n_missions: int) -> str:
-    """Say why a mission needs a refit that is not possible."""
+    """Explain why a mission needs a refit that is not possible."""
     reason = f"k-hat of mission {mission} is {k_hat:.2f}, above {limit:.2f}"
     if n_missions < _FEWEST:
         reason = f"there are only {n_missions} missions"
@@ -213,7 +216,8 @@ def _of_class(posterior: xr.DataTree, model: Model | None) -> LeftOut:
     share = count[some] / count[some].sum()
     whole = fitted.log_evidence(theta)
 
-    # Densities of tick counts are comparable between families; NaN where ticks are unknown.
+    # Densities of tick counts are comparable between families. They are NaN where ticks are
+    # unknown.
     y = fitted.observations.contact_rate
     n_ticks = fitted.observations.n_ticks
     is_density = ~np.isnan(y) & fitted.model.likelihood.is_density(y)
@@ -230,13 +234,13 @@ def _of_class(posterior: xr.DataTree, model: Model | None) -> LeftOut:
     log_likelihood = joined_draws(complete["log_likelihood"].to_dataset()[RATES])
 
     seed = int(posterior.attrs["seed"])
-    known: list[float] = []  # the log evidence of all missions by a refit, once there is one
+    known: list[float] = []  # the log evidence of all missions, after the first refit
 
     def log_density(j: int) -> np.ndarray:
         return whole - fitted.without(j).log_evidence(theta) + shift[j]
 
     def refit(j: int) -> tuple[float, float]:
-        """Compute p(y_j | y_-j) = p(y) / p(y_-j), each from an own fit."""
+        """Compute p(y_j | y_-j) = p(y) / p(y_-j), with a separate fit for each factor."""
         if not known:
             known.append(_log_evidence(fitted, seed)[0])
         rest, k_hat = _log_evidence(fitted.without(j), seed)
@@ -256,7 +260,7 @@ def _of_class(posterior: xr.DataTree, model: Model | None) -> LeftOut:
 
 
 def _n_effective(posterior: xr.DataTree) -> float:
-    """Return the effective number of draws of a posterior from `fit`, by its sampler."""
+    """Return the effective number of draws, as recorded by the sampler of `fit`."""
     name = "kish" if posterior.attrs["sampler"] == "importance" else "ess_bulk"
     return float(posterior.attrs[name])
 
@@ -312,7 +316,7 @@ def _of_function(posterior: xr.DataTree, model: FunctionModel) -> LeftOut:
 
 
 def _unmeasured(mission: Mission) -> Mission:
-    """Return a mission without its contact rates, which keeps the shape of the data."""
+    """Return a mission without its contact rates, but with data of the same shape."""
     bounds = [
         replace(bound, contact_rate=np.full_like(bound.contact_rate, np.nan))
         for bound in mission.bounds
@@ -327,7 +331,7 @@ def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
     """Prepare to leave out missions of a DataTree of a user's own MCMC, without refits.
 
     Raises:
-        TrustboError: If it lacks what makes its log-likelihoods comparable.
+        TrustboError: If information is missing that makes its log-likelihoods comparable.
     """
     for group in ("log_likelihood", "observed_data"):
         if group not in tree.children or RATES not in tree[group].data_vars:

@@ -2,12 +2,12 @@
 
 For Gaussian rates, coefficients and linear predictors are integrated out, and NUTS samples only the
 scores of the hyperparameters, with gradients of the evidence from JAX (see `gradient`). Their
-posterior is skewed: below a score at which a standard deviation is too small to matter, the density
-falls as slowly as the prior, and above it as fast as the likelihood. A step that suits one side
-diverges on the other. NUTS therefore samples `Whitened` coordinates, which are fitted to the points
-of the importance sampler and are nearly independent and standard normal. Warm-up tunes only the
-step size, and chains start at points of the importance sampler. The coordinates change the speed of
-NUTS, but not the distribution that it samples.
+posterior is skewed. Below the score at which a standard deviation is too small to matter, the
+density falls as slowly as the prior; above it, the density falls as fast as the likelihood. A step
+size that suits one side leads to divergences on the other. NUTS therefore samples `Whitened`
+coordinates, which are fitted to the points of the importance sampler and are nearly independent and
+standard normal. Warm-up tunes only the step size, and chains start at points of the importance
+sampler. The coordinates change the speed of NUTS, but not the distribution that it samples.
 
 For other families, EP only approximates the evidence, so NUTS samples `model.program`, including
 coefficients and linear predictors.
@@ -33,19 +33,19 @@ from trustbo.streams import stream
 _POINTS = 2000
 """Number of resampled points to which the coordinates are fitted."""
 _WARMUP_OF_STEP = 150
-"""Number of warm-up draws that tune only a step size."""
+"""Number of warm-up draws if only the step size is tuned."""
 _WARMUP_OF_MASS = 300
-"""Number of warm-up draws that also tune a mass matrix."""
+"""Number of warm-up draws if the mass matrix is also tuned."""
 _ACCEPT = 0.9
 """Target of the acceptance probability."""
 _DEPTH = 3
-"""Most doublings of a trajectory, after which it has 7 steps."""
+"""Largest number of doublings of a trajectory, which then has 7 steps."""
 _FIRST_STEP = 0.4
-"""Step size at which warm-up starts, in sds."""
+"""Initial step size of the warm-up, in sds."""
 _RIDGE = 1e-6
-"""Added to the covariance of the points."""
+"""Number added to the covariance of the points."""
 _SHRINK = 0.01
-"""Penalty of the shape of a marginal, in nats per point."""
+"""Penalty on the shape of a marginal, in nats per point."""
 _SLOPE_STEP = 1e-4
 """Step of the finite differences at the starts of the chains."""
 _FIELDS = {
@@ -62,12 +62,12 @@ class Whitened(NamedTuple):
     """Coordinates in which points are nearly independent and standard normal.
 
     A score is location + scale sinh((arcsinh(y) + skew) / weight), where y = center + root x. The
-    transform of Jones and Pewsey (2009, Biometrika 96) makes skewed marginals, with light or heavy
-    tails, normal; the coordinates x have no correlations.
+    transform of Jones and Pewsey (2009, Biometrika 96) makes skewed marginals with light or heavy
+    tails normal. The coordinates x are uncorrelated.
     """
 
     location: np.ndarray  # (score,)
-    scale: np.ndarray  # (score,), as the next three
+    scale: np.ndarray  # (score,), like the next three
     skew: np.ndarray
     weight: np.ndarray
     center: np.ndarray
@@ -133,8 +133,8 @@ def sample_by_nuts(
         density: Density of a model given missions.
         chains: Number of chains.
         draws: Number of draws per chain.
-        warmup: Number of warm-up draws per chain; by default 150 for Gaussian rates, for which
-            only the step size is tuned, and 300 for others.
+        warmup: Number of warm-up draws per chain. The default is 150 for Gaussian rates, for which
+            only the step size is tuned, and 300 otherwise.
         seed: Random seed.
         progress: Whether to show a progress bar.
 
@@ -156,7 +156,7 @@ def sample_by_nuts(
         if density.exact:
             kernel = _marginal_kernel(density, coordinates)
             starts = _starts(density, coordinates, rng.choice(z, chains, replace=False))
-            if chains == 1:  # NumPyro expects no axis of chains
+            if chains == 1:  # NumPyro expects no axis for chains
                 starts = jax.tree.map(lambda values: values[0], starts)
         else:
             kernel = _full_kernel(density, z)
@@ -206,7 +206,7 @@ def _marginal_kernel(density: Density, coordinates: Whitened) -> NUTS:
 def _starts(density: Density, coordinates: Whitened, z: np.ndarray) -> ParamInfo:
     """Return the states at which chains start, with scores z (chain, score).
 
-    NumPy computes the first potentials and slopes, so that JAX compiles the gradient only once.
+    NumPy computes the first potentials and slopes, so JAX compiles the gradient only once.
     """
     x = coordinates.whiten(z)
     n, d = x.shape

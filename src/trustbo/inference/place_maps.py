@@ -2,11 +2,11 @@
 
 Effects s of unvisited cells are drawn by Matheron's rule: a prior draw over the whole grid is
 corrected by kriging at the visited cells. Prior draws use the fast Fourier transform of a circulant
-covariance on a torus (Dietrich and Newsam 1997), which is so large that correlations around it are
-nearly 0. Length scales are rounded to steps of 10 %, which changes the correlation of neighbouring
-cells by less than 0.01. Effects e of unvisited bounds are drawn from the prior.
+covariance on a torus (Dietrich and Newsam 1997). The torus is so large that correlations around it
+are nearly 0. Length scales are rounded to steps of 10 %, which changes the correlation of
+neighbouring cells by less than 0.01. Effects e of unvisited bounds are drawn from the prior.
 
-The random part of the draws is centred at 0. The mean map is therefore the posterior mean of the
+The random part of the draws is centred at 0. Therefore, the mean map is the posterior mean of the
 effects, without Monte Carlo error in places that were not visited.
 """
 
@@ -31,7 +31,7 @@ _REACH = 5.0
 _JITTER = 1e-9
 """Added to the correlation matrix of visited cells."""
 _FIRST_SEED = 1000
-"""Seed of the length scale 1; steps of the scale may be negative, seeds may not."""
+"""Seed of the length scale 1. Steps of the scale can be negative, but seeds cannot."""
 _CELL = ("row", "col")
 """Axes of a cell."""
 _BOUND = ("move", "row", "col")
@@ -46,8 +46,8 @@ def place_group(
     Args:
         draws: Arrays place (chain, draw, cell), place_bound (chain, draw, bound) and place_robot
             (chain, draw, bound, robot).
-        places: Visited places. If some are on other maps than the workspace, the coordinates
-            `cell_map` and `bound_map` are the numbers of the maps, 0 for the workspace.
+        places: Visited places. If some are not on the map of the workspace, the coordinates
+            `cell_map` and `bound_map` contain the numbers of the maps, 0 for the workspace.
         robots: Names of the robots.
         seed: Random seed for the maps that `params_of` draws.
     """
@@ -80,8 +80,8 @@ def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> di
 
     Returns:
         Arrays place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The
-        axis `effect` has length 1: effects of robots in bounds, which are 0 on average over the
-        team, are those of `robots_in_bounds_of`.
+        axis `effect` has length 1. The effects of robots in bounds, which are 0 on average over the
+        team, are not included; see `robots_in_bounds_of`.
     """
     group = of_workspace(group)
     rows, cols = (int(n) for n in group.attrs["shape"])
@@ -108,7 +108,8 @@ def robots_in_bounds_of(
     Args:
         group: Posterior group `places`.
         parameters: Hyperparameters (draw,) by name, with chains joined.
-        robots: Names of the robots of the result. Nothing is known of a team with other robots.
+        robots: Names of the robots of the result. If some of them were not in the fitted missions,
+            no effect is known.
     """
     group = of_workspace(group)
     rows, cols = (int(n) for n in group.attrs["shape"])
@@ -161,7 +162,7 @@ def _cells(
         rng = np.random.default_rng([*seed, step + _FIRST_SEED])
         free = _prior(shape, scale, int(is_step.sum()), rng) * parameters["tau_s"][is_step, None]
 
-        # Matheron's rule: s and a free draw are both kriged from the visited cells.
+        # Matheron's rule: both s and a free draw are kriged from the visited cells.
         mean[is_step] = s[is_step] @ weights
         off[is_step] = free - free[:, flat] @ weights
 

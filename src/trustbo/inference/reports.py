@@ -18,15 +18,15 @@ from trustbo.statespace.blocks import each
 from trustbo.streams import stream
 
 _ALIKE = 16
-"""Draws of a fitted person's trust for each draw of the population parameters."""
+"""Number of draws of a fitted person's trust per draw of the population parameters."""
 _JITTER = 1e-12
-"""Added to the covariance of a person's trust."""
+"""Number added to the covariance of a person's trust."""
 _LEAST_MASS = 1e-300
-"""Least probability of a report, whose logarithm is finite."""
+"""Smallest probability of a report; its logarithm is finite."""
 _CLOSE = 1e-12
 """Rounding error of a cumulative probability."""
 _FINE = 1e6
-"""Answers are rounded to multiples of 1 / `_FINE`, so that rounding errors do not show."""
+"""Answers are rounded to multiples of 1 / `_FINE` to hide rounding errors."""
 
 
 @computing()
@@ -40,7 +40,7 @@ def predict_reports(
     seed: int = 0,
     model: TrustModel | None = None,
 ) -> xr.Dataset:
-    """Predict each report of fitted or new persons from the earlier reports of the same person.
+    """Predict each report of fitted or new people from the earlier reports of the same person.
 
     The earlier reports determine the weights of draws of the person's start, level and gains.
     Reports at the same bound are not used to predict each other.
@@ -48,7 +48,7 @@ def predict_reports(
     Args:
         posterior: Posterior of `HumanTrust`.
         missions: One mission per person; NaN reports are also predicted.
-        given: `"earlier"` to use earlier reports of the person, or `"none"` to use no reports.
+        given: `"earlier"` to use the earlier reports of the person, or `"none"` to use no reports.
         fitted: Whether the posterior was fitted to the earlier reports of these persons. If so,
             these reports do not change the weights of the population parameters again.
         n_draws: Maximum number of draws of a person's trust.
@@ -58,9 +58,10 @@ def predict_reports(
     Returns:
         Dataset over (mission, bound, robot). `report` and the predicted `mean` and `quantile` (also
         over `level`) are on the answer scale, such as 1 to 7. `log_score` is the log probability of
-        the report in nats (on the unit scale, the log density except at 0 and 1). With levels,
-        `probability` is the probability of each `answer`. Attributes are the mean absolute error
-        `mae` of medians, `mean_log_score`, and `coverage_90`, the coverage of central intervals.
+        the report in nats; on the unit scale, it is the log density except at 0 and 1. With levels,
+        `probability` is the probability of each `answer`. The attributes are `mae`, the mean
+        absolute error of medians, `mean_log_score`, and `coverage_90`, the coverage of central 90 %
+        intervals.
 
     Raises:
         TrustboError: If the posterior is not of `HumanTrust`, or the missions have different inputs
@@ -90,7 +91,7 @@ def predict_reports(
         )
     ahead = Density(of_fit.model, of_fit.model.observations(missions))
 
-    # Earlier reports of a fitted person reweight only the copies of each draw among themselves.
+    # For a fitted person, earlier reports reweight only the copies of each draw among themselves.
     copies = _ALIKE if fitted else 1
     some = np.unique(np.linspace(0, len(draws.c) - 1, max(1, n_draws // copies)).astype(int))
     draws = draws.at(np.repeat(some, copies))

@@ -22,7 +22,7 @@ _DIMS = ("mission", "bound", "robot")
 
 
 class Posteriors(list[xr.DataTree | None]):
-    """Posteriors after each mission of a campaign, which know the missions.
+    """Posteriors after each mission of a campaign, together with the missions.
 
     Attributes:
         missions: All missions of the campaign, in order.
@@ -31,7 +31,7 @@ class Posteriors(list[xr.DataTree | None]):
     def __init__(
         self, posteriors: Iterable[xr.DataTree | None], missions: Sequence[Mission]
     ) -> None:
-        """Store the posteriors, None where there was none yet, and the missions."""
+        """Store the missions and the posteriors, which are None where there was none yet."""
         super().__init__(posteriors)
         self.missions = list(missions)
 
@@ -54,16 +54,16 @@ def score(
     over parameter draws and place effects, and includes process and observation noise.
 
     Args:
-        posterior: Posterior that predicts all `missions` and was fitted to none of them; or all
+        posterior: Posterior that predicts all `missions` and was not fitted to any of them; or all
             posteriors of a campaign (`Result.posteriors`), each of which predicts the next mission.
-        missions: Missions to predict; for a campaign, all missions in order, which
+        missions: Missions to predict. For a campaign, these are all missions in order, which
             `Result.posteriors` contains. Missions without an earlier posterior and missions that
             the campaign excluded are left out.
         workspace: Workspace of the missions, used to fill in missing awareness as in `fit`.
         seed: Random seed for predictive draws and randomised PIT values.
 
     Returns:
-        Dataset over (mission, bound, robot) for the predicted missions, NaN where no rate was
+        Dataset over (mission, bound, robot) for the predicted missions, with NaN where no rate was
         measured. The variables are `contact_rate`, the predicted `mean` and `quantile` (also over
         `level`), `pit` (the probability integral transform, randomised at point masses), and
         `log_score` in nats. Log scores apply to tick counts if every rate has n_ticks, otherwise to
@@ -122,7 +122,7 @@ def score(
         quantile[j, k] = np.moveaxis(np.quantile(drawn, QUANTILES, axis=0), 0, -1)
     quantile[np.isnan(y)] = np.nan
 
-    # Scores of tick counts are comparable between families; NaN where ticks are unknown.
+    # Scores of tick counts are comparable between families. They are NaN where ticks are unknown.
     attrs = {"log_score_of": "contact_rate"}
     shift = trust.likelihood.log_resolution(y, observations.n_ticks)
     if not np.isnan(shift).any():
@@ -209,17 +209,20 @@ def predictions(
     """Pair each mission that can be predicted with the posterior that predicts it.
 
     One posterior predicts all missions. In a campaign, each posterior predicts the next mission.
-    Missions without an earlier posterior are left out, and so are missions that the last posterior
-    was not fitted to, according to its attribute `missions`: they were excluded.
+    Missions without an earlier posterior are left out. Missions to which the last posterior was not
+    fitted, according to its attribute `missions`, were excluded from the campaign and are also left
+    out.
 
     Args:
         who: Name of the public function, for messages.
-        posterior: Posterior, or the posterior after each mission, None where there was none yet.
+        posterior: Posterior, or the posteriors after each mission, with None where there was none
+            yet.
         missions: All missions, in order.
         known: Indices of the missions whose awareness is known; by default, all.
 
     Returns:
-        Posteriors and the indices of the missions that they predict, equally many, maybe none.
+        Posteriors and the indices of the missions that they predict. Both lists have the same
+        length, which may be 0.
 
     Raises:
         TrustboError: If a posterior is not from `fit`, there is none yet, there are no missions, or
@@ -250,7 +253,7 @@ def predictions(
 
 
 def last_posterior(who: str, posteriors: Sequence[xr.DataTree | None]) -> xr.DataTree:
-    """Return the last posterior of a campaign; raises TrustboError if there is none yet."""
+    """Return the last posterior of a campaign; raise TrustboError if there is none yet."""
     trees = [tree for tree in posteriors if tree is not None]
     if not trees:
         raise TrustboError(
@@ -265,6 +268,6 @@ def _pit(drawn: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarr
     below = (drawn < y).sum(0)
     equal = (drawn == y).sum(0)
 
-    # The rank of y among the draws, at random among equal ones.
+    # The rank of y among the draws; ties are broken at random.
     pit = (below + rng.random(y.shape) * (equal + 1.0)) / (len(drawn) + 1.0)
     return np.where(np.isnan(y), np.nan, pit)

@@ -23,14 +23,14 @@ from trustbo.streams import stream
 _OF_RATES = ("mission", "bound", "robot")
 _DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_RATES)
 _N_TRAJECTORIES = 200
-"""Kept draws of latent trust and predicted rates, evenly spaced in the chains."""
+"""Number of kept draws of latent trust and predicted rates, evenly spaced in the chains."""
 N_PRIOR = 500
 """Number of draws in the groups `prior` and `prior_predictive`."""
 _ORDER = ("robot", "robot_", "feature", "feature_")
 """Order of the axes of the parameters of model classes.
 
-`az.summary` labels rows wrongly if two variables have common axes in different orders, or if the
-axes of one are found in other variables first, in another order.
+`az.summary` labels rows incorrectly if two variables have common axes in different orders, or if
+the axes of a variable occur first in other variables, in a different order.
 """
 _KEPT = ("posterior", "sample_stats", "prior", "hazard")
 """Groups kept by `parameters_alone`, besides those of the effects."""
@@ -186,7 +186,8 @@ def with_latent(
         posterior: DataTree with the parameters.
         missions: Fitted missions.
         fitted: Density of the model given the missions.
-        draws: Draws as read from the posterior, so that `add_latent` gives the same later.
+        draws: Draws as read from the posterior, so that a later call of `add_latent` gives the same
+            result.
         progress: Whether to show a progress bar after 5 seconds.
     """
     fitted.reset_ep()
@@ -202,7 +203,8 @@ def with_latent(
     rng = stream(seed, "prior predictive")
     replicated = replicate(fitted, draw_prior(fitted, N_PRIOR, rng), rng)
 
-    # Log likelihoods of tick counts are comparable between families; NaN where ticks are unknown.
+    # Log likelihoods of tick counts are comparable between families. They are NaN where ticks are
+    # unknown.
     likelihood = latent.log_likelihood
     likelihood_of = "contact_rate"
     shift = fitted.model.likelihood.log_resolution(
@@ -254,7 +256,7 @@ def log_prior(fitted: Density, parameters: Mapping[str, np.ndarray]) -> dict[str
     Deviations of robots from a common mean belong to the model and not to the prior, so only means
     and standard deviations are included for `HierarchicalTrust`. In the coupled model, the LKJ
     prior on correlations R has the density det(R)^(concentration - 1), up to a constant. The prior
-    on `delta_v` excludes the noise that is due to the resolution of the rates.
+    on `delta_v` does not include the noise that is due to the resolution of the rates.
 
     Args:
         fitted: Density of the model given missions.

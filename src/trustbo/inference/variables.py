@@ -48,7 +48,7 @@ def prior_parameters(
 ) -> dict[str, np.ndarray]:
     """Draw parameters (draw, ...) by name from the prior, without effects.
 
-    With `even`, hyperparameters are evenly spaced quantiles, and coefficients prior means.
+    With `even`, hyperparameters are evenly spaced quantiles, and coefficients are prior means.
     """
     model = density.model
     observations = density.observations
