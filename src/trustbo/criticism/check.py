@@ -24,17 +24,17 @@ from trustbo.models.families import FAMILIES
 from trustbo.parallel import computing
 
 SIZE = 0.1
-"""Smallest effect on contact that may change a plan."""
+"""Smallest effect on contact that is considered large enough to change a plan."""
 SURE = 0.95
-"""Probability of such an effect that is required to report it."""
+"""Probability above which such an effect is reported."""
 _PAIR = 2
-"""Number of robots that are compared with each other instead of with their median."""
+"""Number of robots for which robots are compared with each other instead of with their median."""
 _SIGNED = 0.6
-"""Prior probability of a sign above which the sign is expected."""
+"""Prior probability above which a sign counts as expected."""
 _COVERAGE = 0.9
 """Probability of the intervals whose coverage is checked."""
 _TOLERANCE = 0.05
-"""Tolerated error of their coverage."""
+"""Tolerated error of the coverage of these intervals."""
 _ERRORS = 2.0
 """Number of standard errors above which a difference is significant."""
 
@@ -46,11 +46,12 @@ class Check(Summary):
     Attributes:
         verdict: The findings that stand out, as text.
         table: One row per check (index `check`). The columns are the text of the `finding`, whether
-            it `stands_out`, the most affected `label`, and the `size` and `probability`.
-        robots: One row per `mission` (counted from 1) and `robot`, with the `effect` (share of line
-            of sight minus the median), its `sd`, the `probability` that it exceeds .1 in size, and
-            `stands_out`. With two robots, the effect is the difference to the other robot in the
-            same mission, so that both rows of a mission have opposite signs.
+            it `stands_out`, the most affected `label`, and the `size` and `probability` of the
+            effect.
+        robots: One row per `mission` (counted from 1) and `robot`. The columns are the `effect`
+            (share of line of sight minus the median), its `sd`, the `probability` that its absolute
+            value exceeds .1, and `stands_out`. With two robots, the effect is the difference from
+            the other robot in the same mission, so the two rows of a mission have opposite signs.
     """
 
     verdict: str
@@ -64,11 +65,11 @@ class Check(Summary):
 
 @runtime_checkable
 class HasPosteriors(Protocol):
-    """Result or campaign, which are defined in a package above this one."""
+    """Result or campaign, whose classes are defined in a package above this one."""
 
     @property
     def posteriors(self) -> Posteriors:
-        """Posteriors after each mission; None where there was none yet."""
+        """Posteriors after each mission, with None where there was none yet."""
         ...
 
 
@@ -89,27 +90,27 @@ def check(
 ) -> Check:
     """Check a fitted model of contact rates for possible problems.
 
-    A robot stands out in a mission if its effect differs from the team's median by more than .1
-    of line of sight, with a probability above .95. With two robots, whose median lies halfway
-    between them, the difference between both is tested instead. A place stands out if its effect
-    differs from the median over the visited places by more than .1 of contact: a shift that most
-    places share cannot be told from the intercept. A weight stands out if its sign contradicts its
-    prior. The coverage of 90 % intervals one mission ahead stands out if it differs from .9 by
-    more than .05 and two standard errors over missions. See also `pit` of `tb.inference.score`
-    for the shape of predictions, `tb.compare` for other models, and
-    `az.psense_summary(posterior)` for the sensitivity to the priors.
+    A robot stands out in a mission if its effect differs from the team's median by more than .1 of
+    line of sight, with a probability above .95. With two robots, the median lies halfway between
+    them, so the difference between the robots is tested instead. A place stands out if its effect
+    differs from the median over the visited places by more than .1 of contact. The median is
+    subtracted because a shift that most places share cannot be distinguished from the intercept. A
+    weight stands out if its sign contradicts its prior. The coverage of 90 % intervals one mission
+    ahead stands out if it differs from .9 by more than .05 and two standard errors over missions.
+    See also `pit` of `tb.inference.score` for the shape of predictions, `tb.compare` for other
+    models, and `az.psense_summary(posterior)` for the sensitivity to the priors.
 
     Args:
-        posterior: Posterior from `fit`; or a result or campaign, which stand for their
-            `posteriors`; or all posteriors of a campaign (`Result.posteriors`). For a campaign, the
-            last posterior is checked, and the predictions of the others are scored.
+        posterior: Posterior from `fit`; a result or campaign, whose `posteriors` are then used; or
+            all posteriors of a campaign (`Result.posteriors`). For a campaign, the last posterior
+            is checked, and the predictions of the others are scored.
         missions: All missions of the campaign; by default, those of `Result.posteriors`, or the
             missions in the last posterior. Missions without an earlier posterior and excluded
             missions are not predicted.
 
     Raises:
-        TrustboError: If the posterior is not from `fit`, was fitted to people's reports, or
-            contains no data although `missions` is None.
+        TrustboError: If the posterior is not from `fit`, if it was fitted to people's reports, or
+            if it contains no data and `missions` is None.
 
     Example:
         >>> result = tb.iterate(workspace, (9, 0), (0, 9), n_iterations=2)
@@ -146,10 +147,10 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     draws = joined_draws(group["robot_effect"]) + _in_all_bounds(posterior, group["robot"].values)
 
     if draws.shape[2] == _PAIR:
-        # The median would lie halfway between both, and neither would stand out.
+        # The median would lie halfway between the two robots, and neither would stand out.
         draws = draws - draws[:, :, ::-1]
     else:
-        # The weight of line of sight already includes what all robots and missions have in common.
+        # The weight of line of sight already includes the part that all robots and missions share.
         draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
     draws = draws / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
 
@@ -169,8 +170,9 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
 def _in_all_bounds(posterior: xr.DataTree, robots: np.ndarray) -> np.ndarray:
     """Return the mean effect of each robot in the visited bounds, (draw, 1, robot), or 0.
 
-    If all missions take one path, a robot that is poor everywhere cannot be told from bounds that
-    are all bad for it. Its mean effect in these bounds therefore counts as an effect of the robot.
+    If all missions take the same path, a robot that is poor everywhere cannot be distinguished from
+    bounds that are all bad for this robot. Its mean effect in these bounds therefore counts as an
+    effect of the robot.
     """
     if "places" not in posterior.children:
         return np.zeros(1)
@@ -194,7 +196,8 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
     mission = robots["mission"].to_numpy()
     robot = robots["robot"].to_numpy()
 
-    # Of two robots, both stand out. One sentence is enough, about the robot with less contact.
+    # If there are two robots, both stand out. One sentence about the robot with less contact is
+    # enough.
     names = list(dict.fromkeys(robot))
     shown = odd & (effect < 0.0) if len(names) == _PAIR else odd
 
@@ -232,10 +235,11 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     total = joined_draws(places["place_bound"]) + of_cells
     inverse_gain = theta_of(posterior, parameters_of(posterior))["inverse_gain"]
     per_drift = inverse_gain.reshape(len(total), -1).mean(1, keepdims=True)
-    draws = total / per_drift  # of stationary trust
+    draws = total / per_drift  # effects on stationary trust
     draws = draws / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
 
-    # A shift that most places share cannot be told from the intercept: no place stands out by it.
+    # A shift that most places share cannot be distinguished from the intercept, so it must not make
+    # any place stand out.
     draws = draws - np.median(draws, axis=1, keepdims=True)
 
     effect = draws.mean(0)
@@ -276,7 +280,7 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
 
 
 def _weights(posterior: xr.DataTree, group: str, name: str) -> np.ndarray:
-    """Return the draws of the weights in a group, (draw, feature), of all robots."""
+    """Return the draws (draw, feature) of the weights in a group, for all robots."""
     weights = joined_draws(posterior[group].to_dataset()[name])
     if name == "B":  # keep the weights of each robot's own features, which have an expected sign
         weights = np.einsum("diim->dim", weights)

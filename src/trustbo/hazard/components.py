@@ -1,13 +1,13 @@
-"""A mixture of few components, which replaces the posterior of failures in path searches.
+"""A mixture of a few components, which replaces the posterior of failures in path searches.
 
 Failures of bounds are correlated because the bounds share an uncertain slope limit. Given the
 hyperparameters, bounds fail independently, so a path fails with probability
 
     E[1 - prod_k (1 - p_k)] = mean over draws of 1 - prod_k (1 - E[p_k | draw]).
 
-A component is a group of draws; they are ordered from low to high failure probabilities. Each group
-is treated as one draw with the mean probabilities of its members, so a search needs only one sum
-per component.
+A component is a group of draws; components are ordered from low to high failure probabilities. Each
+group is treated as a single draw with the mean probabilities of its members, so a search needs only
+one sum per component.
 """
 
 from typing import NamedTuple

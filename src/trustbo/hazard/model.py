@@ -9,8 +9,8 @@ tilt of the steepest route exceeds the slope limit:
     logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2).
 
 The p_e are integrated out, and normal scores of the other parameters are drawn by importance
-sampling. While the proposals are adapted, missions lost at unknown places are treated as
-independent. Then the place of each of these failures is imputed at every point (sequential
+sampling. While the proposals are being adapted, missions lost at unknown places are treated as
+independent. Afterwards, the place of each of these failures is imputed at every point (sequential
 imputation; Kong, Liu and Wong 1994), and the weights are corrected for the joint posterior.
 """
 
@@ -34,21 +34,21 @@ from trustbo.workspace.difficulty import Difficulty, difficulty_of
 from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES
 
 _ROUND = 1024
-"""Points of importance sampling per round."""
+"""Number of points of importance sampling per round."""
 _ENOUGH = 500.0
-"""Effective number of points that is sought."""
+"""Effective number of points at which sampling stops."""
 _MORE = 8
-"""Factor of both numbers in a second attempt, if the weights are uneven."""
+"""Factor by which both numbers are increased for a second attempt if the weights are uneven."""
 _N_DRAWS = 1000
-"""Draws of the posterior."""
+"""Number of posterior draws."""
 _SMALLEST_P = 1e-12
 """Smallest probability of passing that is distinguished from 0."""
 _LARGEST_KHAT = 1e3
-"""Largest k-hat that is stored, so that it is finite also if its estimate is not."""
+"""Largest k-hat that is stored, which keeps it finite even if the estimate is infinite."""
 _POSITIONS = {"strength": -1, "margin": -3}
-"""Positions of two parameters among the normal scores, see `Hazard.of_bounds`."""
+"""Positions of two parameters in the normal scores; see `Hazard.of_bounds`."""
 _MODES = {"strength": 1.5, "margin": 1.8}
-"""Absolute normal scores near which the posterior may have modes: at low and high strength, and at
+"""Absolute normal scores near which the posterior may have modes, for low and high strength and for
 a correct and a wrong limit."""
 _MAPS = "move", "row", "col", "next_move"
 
@@ -62,7 +62,7 @@ def fit_hazard(
     lost: Sequence[LostMission] = (),
     seed: int = 0,
 ) -> xr.Dataset:
-    """Fit the failure probability of every bound, with each next move, by importance sampling.
+    """Fit the failure probability of every bound and next move by importance sampling.
 
     Args:
         missions: Measured missions; may be empty.
@@ -73,21 +73,21 @@ def fit_hazard(
         seed: Random seed; the same seed gives the same posterior.
 
     Returns:
-        The group `hazard` of a posterior. The posterior draws are `intercept` (draw),
-        `coefficient` (draw, measure), `strength` (draw) and, with a terrain, `margin` and `width`
-        (draw) of the slope limit in degrees. `place` (draw, lost) is the number, from 1, of the
-        bound at which each mission lost at an unknown place failed. `p_fail` (move, row, col,
-        next_move) is the posterior mean failure probability of a bound that is followed by a next
-        move, or by the end of the path, and NaN where there is no bound. `trials` and `failures`,
-        of the same shape, count known outcomes. `BoundRisk` draws failure probabilities.
+        The group `hazard` of a posterior. The posterior draws are `intercept` (draw), `coefficient`
+        (draw, measure), `strength` (draw) and, with a terrain, `margin` and `width` (draw) of the
+        slope limit in degrees. `place` (draw, lost) is the number, from 1, of the bound at which
+        each mission lost at an unknown place failed. `p_fail` (move, row, col, next_move) is the
+        posterior mean failure probability of a bound that is followed by a given next move or by
+        the end of the path; it is NaN where there is no bound. `trials` and `failures`, of the same
+        shape, count known outcomes. `BoundRisk` draws failure probabilities.
 
     Raises:
         TrustboError: If the path of a mission skips cells or leaves the grid.
         PosteriorError: If the k-hat of the importance weights exceeds 0.7.
 
     Example:
-        >>> hazard = tb.hazard.fit_hazard(missions, workspace)
-        >>> hazard["p_fail"].max().item()  # of the most dangerous bound
+        >>> hazard = tb.hazard.fit_hazard(missions, workspace) >>> hazard["p_fail"].max().item() #
+        for the most dangerous bound
     """
     started = time.perf_counter()
     hazard = hazard or Hazard()
@@ -201,7 +201,7 @@ def _log_rising(x: np.ndarray, k: np.ndarray) -> np.ndarray:
 def impute(
     a: np.ndarray, b: np.ndarray, paths: Sequence[np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw the bounds at which lost missions failed, one mission after the other.
+    """Draw the bounds at which lost missions failed, one mission after another.
 
     Args:
         a: Alpha of each bound's Beta distribution without the lost missions, shape (point, bound).
@@ -248,8 +248,8 @@ def _lookahead(
 ) -> np.ndarray:
     """Compute the factor by which a failure at each bound makes later failures more probable.
 
-    Without this factor (point, bound), the rare points that attribute several failures to one bound
-    would have large weights.
+    The factor has shape (point, bound). Without it, the few points that attribute several failures
+    to one bound would have large weights.
     """
     favour = np.ones((len(a), len(path)))
     for other in later:
@@ -278,7 +278,7 @@ def _to_dataset(
     degrees = {"units": "degrees"}
     of_limit = {
         name: ("draw", values, degrees)
-        for name, values in zip(LIMIT_NAMES, limit.T, strict=False)  # none without a limit
+        for name, values in zip(LIMIT_NAMES, limit.T, strict=False)  # empty without a limit
     }
 
     n = np.zeros(difficulty.unit.shape)

@@ -18,9 +18,9 @@ TILT = "tilt"
 LIMIT_NAMES = ("margin", "width")
 """Parameters of the robots' slope limit, in degrees."""
 FLOOR = 1e-12
-"""Smallest alpha and beta of a Beta prior, needed because the prior mean may round to 0 or 1."""
+"""Smallest alpha and beta of a Beta prior, because the prior mean may round to 0 or 1."""
 _LARGEST_LOG = 50.0
-"""Largest absolute log of the width and the strength."""
+"""Largest absolute value of the log width and the log strength."""
 _FARTHEST = 40.0
 """Largest tabulated quantile of the margin, in sds of the wider normal."""
 _N_TABULATED = 4000
@@ -31,27 +31,27 @@ _N_TABULATED = 4000
 class Hazard:
     """Priors on the probability that a bound ends the mission; normal priors are (mean, sd) pairs.
 
-    By default, the stated slope limit is accurate to half a degree with probability .9, and wrong
-    by about 4 degrees with probability .1.
+    By default, the stated slope limit is accurate to within half a degree with probability .9, and
+    wrong by about 4 degrees with probability .1.
 
     Attributes:
         intercept: Prior on the logit of the mean failure probability at medium difficulty.
         coefficient: Prior on the weight of each difficulty measure. Difficulty is 0 for an easy
             route and 1 at the robots' limit. Tilt has no weight, as the slope limit includes it.
         margin: Prior on the number of degrees by which the true slope limit is below the stated
-            limit, if the stated limit is about right. All bounds share the margin, so a failure on
-            one bound makes failures on equally steep bounds more probable.
+            limit, if the stated limit is approximately correct. All bounds share the margin, so a
+            failure on one bound makes failures on equally steep bounds more probable.
         doubt: Probability that the stated limit is wrong, and the sd of the margin in that case, in
             degrees. The prior on the margin is a mixture of two normals with the same mean. Use a
             probability of 0 if the limit was measured.
-        log_width: Prior on the log of the limit's width in degrees, .3 by default. The failure
-            probability increases from .1 to .9 if the tilt increases by 4.4 widths. Use a larger
-            width if the tilt of the driven curve is known less well.
+        log_width: Prior on the log of the limit's width in degrees, .3 by default. If the tilt
+            increases by 4.4 widths, the failure probability increases from .1 to .9. Use a larger
+            width if the tilt along the driven curve is less well known.
         log_strength: Prior on the log of the strength s, the number of observations that the prior
-            mean of a bound is worth. If each bound either always or never fails, s is small.
+            mean of a bound is worth. If every bound fails either always or never, s is small.
 
     Raises:
-        TrustboError: If an sd is not positive, or the probability in `doubt` is outside [0, 1).
+        TrustboError: If an sd is not positive, or if the probability in `doubt` is outside [0, 1).
 
     Example:
         >>> measured = tb.hazard.Hazard(doubt=(0.0, 4.0))  # the slope limit was measured
@@ -95,8 +95,9 @@ class Hazard:
 class BoundPrior(NamedTuple):
     """Beta priors on the failure probabilities of bounds, as functions of normal scores z.
 
-    Each parameter is center + scale z, except that the width and the strength are exp(center +
-    scale z), and the margin is the quantile of its mixture prior at probability Phi(z).
+    Each parameter is center + scale z, with two exceptions: the width and the strength are
+    exp(center + scale z), and the margin is the quantile of its mixture prior at probability
+    Phi(z).
     """
 
     center: np.ndarray  # (parameter,)
@@ -167,7 +168,8 @@ def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
 def mixture_quantile(z: np.ndarray, narrow: float, share: float, wide: float) -> np.ndarray:
     """Solve Phi(z) = (1 - share) Phi(x / narrow) + share Phi(x / wide) for x.
 
-    The interpolation error is about 1e-5 `narrow`. In the far tails, the slope is the larger sd.
+    The interpolation error is about 1e-5 times `narrow`. In the far tails, the slope is the larger
+    sd.
     """
     curve = _quantile_curve(float(narrow), share, wide)
     end = curve.x[-1]

@@ -22,18 +22,18 @@ from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES, bounds_and_next
 ROUNDING = 1e-12
 """Tolerance for rounding errors when the risk of a path is compared with its limit."""
 _BAND = (0.05, 0.95)
-"""Levels of the ends of `p_arrive_band`."""
+"""Quantile levels of the ends of `p_arrive_band`."""
 _ENTRIES = 1 << 20
 """Maximum size of an array (draw, bound)."""
 _SOME = 256
-"""Approximate number of bounds whose mean probability orders the draws."""
+"""Approximate number of bounds whose mean failure probability determines the order of the draws."""
 
 
 class BoundRisk(Summary):
     """Posterior of the probability that each bound of a workspace ends the mission.
 
-    Maps have shape (move, row, col, next_move), where (row, col) is the cell that a bound enters,
-    moves are ordered as in `MOVES`, and the last next move is the end of the path. Failure
+    Maps have shape (move, row, col, next_move), where (row, col) is the cell that a bound enters.
+    Moves are ordered as in `MOVES`, and the last next move is the end of the path. Failure
     probabilities are NaN where there is no bound.
 
     Attributes:
@@ -42,7 +42,7 @@ class BoundRisk(Summary):
         trials: Number of trials with a known outcome, shape (move, row, col, next_move).
         failures: Number of failures at a known bound, shape (move, row, col, next_move).
         steepness: Degrees by which each bound exceeds the stated slope limit, shape (move, row,
-            col, next_move), or None without a limit.
+            col, next_move); None without a limit.
 
     Example:
         >>> risk = tb.hazard.BoundRisk(tb.hazard.fit_hazard(missions, workspace), workspace)
@@ -56,7 +56,8 @@ class BoundRisk(Summary):
         """Read the group `hazard` of a posterior (see `fit_hazard`) for a workspace.
 
         Raises:
-            TrustboError: If the group was made by version 0.4 or earlier, or is for other cells.
+            TrustboError: If the group was made by version 0.4 or earlier, or if its cells are not
+                those of the workspace.
         """
         difficulty = difficulty_of(workspace)
         shape = difficulty.unit.shape
@@ -147,7 +148,7 @@ class BoundRisk(Summary):
 
     @property
     def has_failures(self) -> bool:
-        """Whether any failure was recorded, at a known or an unknown bound."""
+        """Whether any failure was recorded, at a known or unknown bound."""
         return bool(self.failures.any()) or len(self._lost) > 0
 
     @cached_property
@@ -169,7 +170,7 @@ class BoundRisk(Summary):
 
         Args:
             n: Number of draws. The hyperparameter draws are evenly spaced in order of severity, so
-                few draws suffice to estimate the mean arrival probability.
+                a few draws suffice to estimate the mean arrival probability.
             seed: Random seed.
         """
         rng = np.random.default_rng(seed)
@@ -183,7 +184,7 @@ class BoundRisk(Summary):
         return self._maps(out)
 
     def components(self, n: int = 5) -> Components:
-        """Average the failure probabilities within at most `n` groups of draws (see `Components`).
+        """Average the failure probabilities in at most `n` groups of draws (see `Components`).
 
         The mean of the groups, weighted by their sizes, equals the mean over all draws.
         """
@@ -232,7 +233,7 @@ class BoundRisk(Summary):
         b += self._trials[units] - failed
 
         n_units = len(self._trials)
-        position = np.full(n_units + 1, -1)  # the last stands for bounds that do not exist
+        position = np.full(n_units + 1, -1)  # the last entry stands for bounds that do not exist
         position[:n_units][units] = np.arange(len(failed))
         for j, path in enumerate(self._lost):
             add_lost(position[self._unit[*path.T]], self._place[draws, j] - 1, a, b)
@@ -251,7 +252,8 @@ def _rows_of_failures(p_fail: np.ndarray) -> Rows:
 def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
     """Update a and b (point, bound) with a mission that failed at index `place` (point,) of `path`.
 
-    `path` contains indices of bounds in `a` and `b`, negative for bounds that `a` and `b` lack.
+    `path` contains indices of bounds in `a` and `b`; they are negative for bounds that `a` and `b`
+    do not contain.
     """
     for k, e in enumerate(path):
         if e >= 0:
@@ -265,8 +267,8 @@ class Risk(Summary):
     """Probability that each bound of a workspace ends the mission.
 
     Attributes:
-        p_fail: Posterior mean, shape (move, row, col, next_move), with moves as in `MOVES`; the
-            last next move is the end of the path. It is NaN where there is no bound.
+        p_fail: Posterior mean, shape (move, row, col, next_move), with moves as in `MOVES`. The
+            last next move is the end of the path. `p_fail` is NaN where there is no bound.
         draws: Posterior draws, shape (draw, move, row, col, next_move), or None.
         components: Mean failure probabilities of groups of draws, used for the failure probability
             of a path. If None, bounds are assumed to fail independently with probability `p_fail`.
@@ -312,7 +314,8 @@ class Risk(Summary):
     def failure(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Compute the failure probability of a path, for `failure_cost` and `max_failure`.
 
-        It is averaged over the components, since failures of bounds are correlated.
+        The failure probability is averaged over the components, because failures of bounds are
+        correlated.
         """
         index = tuple(bounds_and_next(path).T)
         if self.components is None:
@@ -347,8 +350,8 @@ def read_risk(what: str, values: ArrayLike, leading: Sequence[str] = ()) -> np.n
 
     Args:
         what: Name of the argument in messages.
-        values: Array of that shape, or without the axis of the next moves, which then do not
-            matter. A DataArray is read by its dims and labels.
+        values: Array of this shape; or without the axis of next moves, which then do not matter. A
+            DataArray is read by its dims and labels.
         leading: Names of the leading axes.
 
     Raises:
@@ -370,10 +373,10 @@ class PathRisk(NamedTuple):
     p_fail: np.ndarray
     """Posterior mean probability that each bound, once begun, ends the mission, shape (bound,)."""
     p_arrive: float
-    """Probability of reaching the goal. Given draws, it is the mean over draws of the product of
-    1 - p_fail, since failures are correlated; otherwise, it is the product of the means."""
+    """Probability of reaching the goal. With draws, it is the mean over draws of the product of 1 -
+    p_fail, because failures are correlated; without draws, it is the product of the means."""
     p_arrive_band: tuple[float, float]
-    """Ends of the 90 % band of `p_arrive` over the draws, or NaN without draws."""
+    """Ends of the 90 % band of `p_arrive` over the draws; NaN without draws."""
 
     def to_record(self) -> dict[str, Any]:
         """Convert the risk to plain lists and numbers."""

@@ -14,7 +14,7 @@ from trustbo.errors import TrustboError
 from trustbo.workspace.moves import bounds_and_next
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
-"""Statuses of bounds that failed; aborted bounds and missions do not count as failed."""
+"""Statuses of bounds that failed; aborted bounds and missions do not count as failures."""
 
 
 class LostMission(NamedTuple):
@@ -52,8 +52,8 @@ class Trials(NamedTuple):
         """Count the trials in measured missions and in lost missions.
 
         The last bound of a failed mission counts as a failure, and so does each earlier bound that
-        failed. An aborted bound is not counted. Neither is a bound back from a bound that was not
-        completed, unless it fails, because only a part of it was driven.
+        failed. An aborted bound is not counted. A bound back from a bound that was not completed is
+        not counted either, unless it fails, because the robots drove only a part of it.
 
         Raises:
             TrustboError: If a path skips cells or does not enter `where`.
@@ -77,9 +77,9 @@ class Trials(NamedTuple):
         """Add up the trials of each unit, whose next moves pass or fail together.
 
         Args:
-            unit: Next move that stands for the unit of each bound, (move, row, col, next_move); see
+            unit: Next move that represents the unit of each bound, (move, row, col, next_move); see
                 `workspace.difficulty.Difficulty`. It is negative for a bound that is not on the
-                map, which is a unit of its own.
+                map, which forms its own unit.
         """
         rows = self.bounds.copy()
         of_rows = unit[*rows.T]
@@ -103,7 +103,7 @@ def _reported(mission: Mission) -> tuple[np.ndarray, np.ndarray]:
         if status == "ok" and not goes_back:
             is_known[k] = True
 
-    # The path is the planned one, so that the next move is known also for the last bound.
+    # The path is the planned one, so the next move is also known for the last bound.
     tried = bounds_and_next(path[: len(statuses) + 2])[: len(statuses)]
     return tried[is_known], fails[is_known]
 

@@ -5,10 +5,11 @@
     f_k = x_k + v_k,                v_k ~ N(0, R)                        linear predictor
     y_k ~ likelihood(f_k, sd)                                            contact rate
 
-The input of a bound either is carried over to later bounds (u, a drift) or is not (o, an offset).
+The input of a bound is either carried over to later bounds (u, a drift) or not (o, an offset).
 
-`form` contains the parameters A, Q, m0, P0, R and sd; `kalman` the recursion over bounds; and
-`blocks` the joint normal distribution of all bounds. Models define the parameters and the inputs.
+`form` contains the parameters A, Q, m0, P0, R and sd, `kalman` contains the recursion over bounds,
+and `blocks` contains the joint normal distribution of all bounds. Models define the parameters and
+the inputs.
 """
 
 from trustbo.statespace.form import Inputs, StateSpace

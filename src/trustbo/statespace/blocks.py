@@ -41,7 +41,7 @@ class Layout(NamedTuple):
             y: Contact rates (mission, bound, robot), NaN where not measured.
             joint: Whether robots depend on each other.
             exchangeable: Whether robots depend on each other only through equal, shared noise. If
-                all of them are measured together, their Helmert contrasts are independent.
+                all robots are measured together, their Helmert contrasts are independent.
             carried: See `Layout.carried`.
             apart: See `Layout.apart`.
         """
@@ -95,8 +95,8 @@ class Layout(NamedTuple):
     def design(self, U: Any) -> Any:
         """Rearrange a sparse design matrix (observation, column) to (block * input, column).
 
-        If only some columns are carried over, each block has first their inputs in all rows, and
-        then the inputs of the other columns.
+        If only some columns are carried over, the inputs of a block begin with those of these
+        columns in all rows, followed by those of the other columns.
         """
         n_missions, n_bounds, n_robots = self.shape
         n_rows = n_bounds * n_robots
@@ -133,7 +133,7 @@ class LinearPredictor(NamedTuple):
     trust_cov: Any
     """S, shape (point, label, row, row)."""
     noise_sd: Any
-    """Standard deviation of the own noise of each rate, shape (point, 1, 1 or row)."""
+    """Standard deviation of each rate's own noise, shape (point, 1, 1 or row)."""
     shared_cov: Any = None
     """Covariance of shared noise, shape (point, label, row, row), or None."""
 

@@ -1,4 +1,4 @@
-"""Parameters of the state-space form, and their constructors for the paper's equations."""
+"""Parameters of the state-space form, and constructors for the paper's equations."""
 
 from typing import Any, NamedTuple, Self
 
@@ -22,7 +22,7 @@ class StateSpace(NamedTuple):
         d_k = A d_{k-1} + u_k + w_k,    w_k ~ N(0, Q),    d_0 ~ N(m0, P0)
         x_k = d_k + o_k,    f_k = x_k + v_k,    v_k ~ N(0, R),    y_k ~ likelihood(f_k, sd)
 
-    Robots are divided in groups, which are independent of each other. The members of a group
+    Robots are divided into groups that are independent of each other. The members of a group
     influence each other or share noise. A model without such dependence has groups of one robot.
     The axis `group` has length 1 if all groups have equal parameters. The leading axis `point` runs
     over values of the hyperparameters, for example over draws.
@@ -81,8 +81,8 @@ class StateSpace(NamedTuple):
         """Return the form of orthonormal combinations (combination, robot) of exchangeable robots.
 
         A, Q and P0 must be multiples of the identity, and R a multiple of 11'. Combinations are
-        independent, so each is a group. Only the first one, which is the scaled mean of the robots,
-        has a mean and shared noise. The axis `group` is therefore (first, others).
+        independent, so each is a group. Only the first one, which is the scaled mean over the
+        robots, has a nonzero mean and shared noise. The axis `group` is therefore (first, others).
         """
         sums = rotation[:2].sum(1)  # sqrt(n) and 0
         mean = self.initial_mean[..., :1] * sums[:, None]
@@ -161,8 +161,8 @@ def independent_robots(
         x0_mean: Mean of the state before the first bound, shape (), (point,) or (point, robot).
         x0_sd: Standard deviation of the state before the first bound, of the same shapes.
         delta_s: Standard deviation of the noise s that all robots share, shape (point,), or None.
-        n_members: 1 for groups of one robot, or the number of robots for one group of all robots,
-            as is needed with `delta_s`.
+        n_members: 1 for groups of one robot, or the number of robots for a single group, which
+            `delta_s` requires.
     """
     xp = namespace(beta0)
     n_points = len(beta0)
@@ -202,7 +202,8 @@ def coupled_robots(
 
         x_k = B0 x_{k-1} + u_k + w_k,    y_k = x_k + v_k,    w ~ N(0, Delta_w), v ~ N(0, Delta_v)
 
-    Half of the least eigenvalue of Delta_v is the own noise of each rate, and the rest is shared.
+    Half of the smallest eigenvalue of Delta_v is each rate's own noise variance; the rest of
+    Delta_v is shared noise.
 
     Args:
         B0: Transition matrix, shape (point, robot, robot).
@@ -210,7 +211,7 @@ def coupled_robots(
         Delta_v: Covariance of the observation noise, shape (point, robot, robot).
         x0_mean: Mean of trust before the first bound, shape (), (point,) or (point, robot).
         x0_sd: Standard deviation of trust before the first bound, of the same shapes.
-        adds_noise: Whether the observation family adds noise to the linear predictor; otherwise
+        adds_noise: Whether the observation family adds noise to the linear predictor. If not,
             Delta_v is diagonal and robots share no noise.
     """
     xp = namespace(B0)

@@ -1,7 +1,7 @@
 """The recursion over bounds: prediction, update, simulation and expected trust.
 
-All functions are pure, and take the parameters as a `StateSpace`. They work in NumPy and, except
-for those that draw random numbers, in JAX.
+All functions are pure and take the parameters as a `StateSpace`. They work in NumPy and, unless
+they draw random numbers, in JAX.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,7 +16,7 @@ _JITTER = 1e-12  # added to covariances, which may be singular, before drawing
 
 
 class MomentMatching(Protocol):
-    """The part of a likelihood that `update` needs."""
+    """The method of a likelihood that `update` needs."""
 
     def moment_match(self, y: Any, n_ticks: Any, mean: Any, var: Any, sd: Any, /) -> Any:
         """Match the moments of N(f; mean, var) times the likelihood of the rate y.
@@ -68,8 +68,8 @@ def predict(space: StateSpace, belief: Belief, inputs: Inputs) -> Belief:
 
     m = A m + u,    P = A P A' + Q,
 
-    where m is the mean of the state d. A belief is of trust d + o, so the old offset is subtracted
-    and the new one is added.
+    where m is the mean of the state d. Since a belief describes trust d + o, the old offset is
+    subtracted and the new one is added.
     """
     A = space.transition
     state = belief.mean - belief.offset
@@ -120,7 +120,7 @@ def update(
 def condition(
     mean: Any, cov: Any, k: int, rate: Any, n_ticks: Any, sd: Any, likelihood: MomentMatching
 ) -> tuple[Any, Any, Any]:
-    """Condition joint normals (..., n) on a rate, whose linear predictor is their entry k.
+    """Condition joint normals (..., n) on a rate whose linear predictor is entry k.
 
     Returns:
         The mean (..., n) and covariance (..., n, n) given the rate, and its log mass (...,).
@@ -138,7 +138,7 @@ def condition(
 def marginal_log_densities(
     space: StateSpace, predicted: Belief, y: np.ndarray, n_ticks: np.ndarray, likelihood: Likelihood
 ) -> np.ndarray:
-    """Compute the marginal log density (point, robot) of each rate, 0 for NaN rates."""
+    """Compute the marginal log density (point, robot) of each rate; it is 0 for NaN rates."""
     cov = predicted.cov
     if space.shared_cov is not None:
         cov = cov + space.shared_cov
@@ -246,7 +246,7 @@ def gaussian_match(y: Any, mean: Any, var: Any, sd: Any) -> tuple[Any, Any, Any]
 
 
 class GaussianRates:
-    """Likelihood of Gaussian rates in NumPy or JAX, which does not use the tick counts.
+    """Likelihood of Gaussian rates in NumPy or JAX; tick counts are not used.
 
     NaN marks rates that were not measured.
     """

@@ -1,4 +1,4 @@
-"""Formulas that work for NumPy and for JAX arrays."""
+"""Formulas that work with both NumPy and JAX arrays."""
 
 from types import ModuleType
 from typing import Any
@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 _JITTER = 1e-12
-"""Added to covariances, which may be singular, before their factors are computed."""
+"""Number added to covariances, which may be singular, before they are factored."""
 _JITTER_32 = 1e-6
-"""The same in single precision, the default of JAX."""
+"""The same number for single precision, the default of JAX."""
 
 
 def namespace(x: Any) -> ModuleType:
@@ -37,7 +37,7 @@ def apply(A: Any, x: Any) -> Any:
 
 
 def repeat_diagonal(A: Any, n: int) -> Any:
-    """Make block-diagonal matrices with n copies of matrices (..., m, m), as kron(I_n, A)."""
+    """Make block-diagonal matrices with n copies of matrices (..., m, m), like kron(I_n, A)."""
     m = A.shape[-1]
     blocks = np.eye(n)[:, None, :, None] * A[..., None, :, None, :]
     return blocks.reshape(*A.shape[:-2], n * m, n * m)
