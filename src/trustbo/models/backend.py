@@ -1,11 +1,12 @@
-"""Import numpyro with its submodules, and define the JAX settings for all computations.
+"""Import numpyro and its submodules, and define the JAX settings for all computations.
 
 In Jupyter without ipywidgets, importing numpyro issues the warning "IProgress not found". The
 warning is silenced because text progress bars suffice.
 
 arviz_base leaves a lazily loaded numpyro in `sys.modules`. If a submodule is imported first, as in
 `import arviz; import numpyro.distributions`, Python executes that package twice, and the second one
-lacks its submodules as attributes. Accessing an attribute of numpyro first avoids this, as below.
+lacks its submodules as attributes. Accessing an attribute of numpyro first, as below, avoids this
+problem.
 """
 
 import warnings
@@ -100,7 +101,7 @@ def call(prior: Any, method: str, x: jax.Array) -> jax.Array:
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Use float64 and the threefry generator, whatever JAX flags the caller has set."""
+    """Use float64 and the threefry generator, regardless of the caller's JAX flags."""
     with (
         jax.enable_x64(True),
         jax.default_prng_impl("threefry2x32"),

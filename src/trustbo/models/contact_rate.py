@@ -29,16 +29,17 @@ class ContactRate(dist.Distribution):
     (1)-(2). The batch shape is (mission,) and the event shape is (bound, robot). NaN marks rates
     that were not measured.
 
-    For `tb.fit` and `tb.Campaign`, give a function with this distribution at the site
-    `contact_rate`. `drift` may be any JAX function of the inputs and of sampled variables.
+    To define your own model, pass `tb.fit` or `tb.Campaign` a function with this distribution at
+    the site `contact_rate`. `drift` can be any JAX function of the inputs and of sampled variables.
 
     The function is called with the inputs that its parameters name: awareness (mission, bound,
     robot, feature); contact_rate, n_ticks and duration in s (mission, bound, robot); cell (mission,
     bound, 2), with rows and columns; bound (mission, bound, 3), with moves, rows and columns; and
-    features, the names of the features. Missions and bounds are padded: there, rates are NaN,
-    indices are -1, and other inputs are 0. Ticks and durations that are not known, as before a
-    mission, are NaN. To plan, the drift of a bound may depend only on awareness, cell and move of
-    this bound. Sample a variable of each mission within the plate of missions.
+    features, the names of the features. Missions and bounds are padded; in the padding, rates are
+    NaN, indices are -1, and other inputs are 0. Ticks and durations that are not known, for example
+    before a mission, are NaN. For planning, the drift of a bound may depend only on the awareness,
+    cell and move of this bound. Sample variables that differ between missions within the plate of
+    missions.
 
     Example:
         >>> def saturating(awareness, features, contact_rate=None):
@@ -86,15 +87,15 @@ class ContactRate(dist.Distribution):
             x0_mean: Mean of trust before the first bound, shape () or (robot,).
             x0_sd: Standard deviation of trust before the first bound, shape () or (robot,).
             offset: Input that affects the trust of one bound only, shape () or that of `drift`. A
-                model with an offset cannot plan. With memory of deviations, give all inputs as
-                `offset`, a drift of zeros and x0_mean = 0.
+                model with an offset cannot plan. For memory of deviations, pass all inputs as
+                `offset`, with a drift of zeros and x0_mean = 0.
             delta_s: Standard deviation of the noise s that all robots share, shape (), or None.
             n_ticks: Number of ticks of each rate, in the shape of `drift`. If every measured rate
-                has one, `log_prob` is of the counts of ticks, as the log-likelihoods of `fit` are;
-                otherwise, it is the density of the rates.
+                has one, `log_prob` refers to the tick counts, like the log-likelihoods of `fit`;
+                otherwise, it is the log density of the rates.
 
         Raises:
-            TrustboError: The drift or a parameter has another shape.
+            TrustboError: If the drift or a parameter has the wrong shape.
         """
         u = jnp.asarray(drift, float)
         if u.ndim != 3:
@@ -237,7 +238,7 @@ class ContactRate(dist.Distribution):
 
 
 def _checked(name: str, value: ArrayLike, n_robots: int, may_be_matrix: bool) -> Array:
-    """Return a parameter as an array of floats; raises TrustboError if its shape is wrong."""
+    """Return a parameter as an array of floats; raise TrustboError if its shape is wrong."""
     array = jnp.asarray(value, float)
     allowed: list[tuple[int, ...]] = [(), (1,), (n_robots,)]
     if may_be_matrix:

@@ -21,7 +21,7 @@ from trustbo.statespace.matrices import namespace
 @Renamed(observation="family")
 @dataclass(frozen=True, repr=False)
 class CoupledTrust(TrustModel):
-    """Model in which robots influence each other and have separate parameters, equations (1)-(2).
+    """Model in which robots have separate parameters and influence each other, equations (1)-(2).
 
     The vectors x_k of trust and y_k of contact rates in bound k are ::
 
@@ -42,7 +42,7 @@ class CoupledTrust(TrustModel):
         return CoupledWeights(self.priors)
 
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
-        """See `TrustModel.hyperpriors`; the correlations R are given by partial correlations."""
+        """See `TrustModel.hyperpriors`; partial correlations determine the correlations R."""
         n = n_robots
         priors = self.priors
         names = ("beta0", "delta_w", "delta_v")
@@ -131,7 +131,7 @@ def correlation_factor(r: Any, n: int) -> Any:
     rows = []
     for i in range(n):
         row = []
-        length = xp.ones(len(r))  # of the rest of the row, because rows have length 1
+        length = xp.ones(len(r))  # length of the rest of the row; whole rows have length 1
         for _ in range(i):
             row.append(r[:, k] * length)
             length = length * xp.sqrt(1.0 - r[:, k] ** 2)

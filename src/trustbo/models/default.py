@@ -12,7 +12,7 @@ def default_model(*, places: bool = True, priors: Priors | None = None) -> Poole
     Args:
         places: Whether to include place effects, which need missions with a map.
         priors: Priors on the parameters; by default those for the features (see
-            `Priors.from_features`). `PooledTrust(priors=...)` would have no effects.
+            `Priors.from_features`). Note that `PooledTrust(priors=...)` has no effects.
 
     Example:
         >>> priors = tb.models.Priors.from_features(workspace.features)

@@ -12,7 +12,7 @@ class Draws(ABC):
     """Draws of the parameters of a trust model: a state-space form, and the inputs of bounds.
 
     Inputs are computed when they are needed, for the bounds of a path or for all bounds of a map,
-    since an array (draw, robot, move, row, col) of a large map does not fit in memory.
+    because an array (draw, robot, move, row, col) of a large map does not fit in memory.
     """
 
     __slots__ = ()
@@ -33,17 +33,17 @@ class Draws(ABC):
     @property
     @abstractmethod
     def n_features(self) -> int | None:
-        """Number of features; None if the draws do not say."""
+        """Number of features; None if the draws do not determine it."""
 
     @property
     @abstractmethod
     def by_robot(self) -> bool:
-        """Whether the mean trust of the robots does not obey the equation of a single robot."""
+        """Whether the robots' mean trust does not obey the equation of a single robot."""
 
     @property
     @abstractmethod
     def grid_shape(self) -> tuple[int, int] | None:
-        """Shape (row, col) of the map whose cells the inputs depend on; None if on no cell."""
+        """Shape (row, col) of the map on whose cells the inputs depend; None if on no cell."""
 
     @property
     @abstractmethod
@@ -52,7 +52,7 @@ class Draws(ABC):
 
     @abstractmethod
     def require_valid(self, n_robots: int | None = None, n_features: int | None = None) -> None:
-        """Raise TrustboError if a value cannot be used, or these numbers are given and differ."""
+        """Raise TrustboError if a value is invalid, or if the given numbers do not match."""
 
     @abstractmethod
     def state_space(self, n_robots: int, *, adds_noise: bool = True) -> StateSpace:
@@ -91,7 +91,7 @@ class Draws(ABC):
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
-        """Describe the draws by plain numbers, keyed by name, for files."""
+        """Return a description of the draws for files, as plain numbers keyed by name."""
 
     def team_inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
         """Compute the mean of `inputs` over robots, with the axis (robot,) of length 1."""
@@ -100,7 +100,7 @@ class Draws(ABC):
 
     @property
     def initial_offset(self) -> Any:
-        """Offset before the first bound: trust is x0_mean, whatever is carried over."""
+        """Offset before the first bound, so that trust is x0_mean in any case."""
         return 0.0 if self.carried else self.x0_mean
 
     def as_inputs(self, u: Any) -> Inputs:

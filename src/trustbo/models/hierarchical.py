@@ -54,8 +54,8 @@ class HierarchicalTrust(PooledTrust):
     def dims(self) -> dict[str, tuple[str, ...]]:
         """See `TrustModel.dims`.
 
-        `az.summary` would label the rows of `beta` wrongly after a variable with the axis `feature`
-        alone.
+        `az.summary` would label the rows of `beta` incorrectly if a variable with only the axis
+        `feature` came first.
         """
         return super().dims | {
             "beta": ("robot", "feature"),

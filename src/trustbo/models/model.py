@@ -36,7 +36,7 @@ _PRIOR_OF = {
     "partial_v": "concentration",
 }
 """Fields of `Priors` whose hyperparameters have other names."""
-_JITTER = 1e-13  # added to the covariance of trust, so that rounding does not make it singular
+_JITTER = 1e-13  # added to the covariance of trust, which rounding could make singular
 
 
 @Renamed(observation="family")
@@ -44,21 +44,21 @@ _JITTER = 1e-13  # added to the covariance of trust, so that rounding does not m
 class TrustModel(Summary, ABC):
     """Base class of trust models.
 
-    A subclass defines `weights`, `hyperpriors`, `derived`, `state_space` (the equation) and `dims`
-    and, if robots depend on each other, `joint`. Hyperparameters must include `delta_w` and
-    `delta_v`, and `dims` must list every parameter that planning needs.
+    A subclass defines `weights`, `hyperpriors`, `derived`, `state_space` (the equation) and `dims`.
+    If robots depend on each other, it also defines `joint`. Hyperparameters must include `delta_w`
+    and `delta_v`, and `dims` must list every parameter that planning needs.
 
     Attributes:
         priors: Prior on each parameter. The default depends on the observation family and the
             feature names; see `Priors.from_features`.
-        family: Observation family: `"gaussian"` as in the paper, `"censored"` for rates that
-            are censored at 0 and 1, or `"beta_binomial"` for the number of ticks in
-            contact out of `Bound.n_ticks`, with trust on the logit scale.
+        family: Observation family: `"gaussian"` as in the paper, `"censored"` for rates that are
+            censored at 0 and 1, or `"beta_binomial"` for the number of ticks in contact out of
+            `Bound.n_ticks`, with trust on the logit scale.
         effects: Effects on the drift, such as `PlaceEffect()` for places and `RobotEffect()` for
             each robot in each mission. The paper's models have no effects.
 
     Raises:
-        TrustboError: If `family` is unknown, or `effects` contains a wrong or repeated class.
+        TrustboError: If `family` is unknown, or if `effects` contains a wrong or repeated class.
     """
 
     priors: Priors = None  # pyright: ignore[reportAssignmentType]
@@ -136,14 +136,14 @@ class TrustModel(Summary, ABC):
     def random_effects(self, theta: Theta, observations: Observations) -> Inputs | None:
         """Return inputs (point, mission, row, effect) of effects that belong to one mission each.
 
-        The effects are standard normal and integrated out with trust, so they have no columns.
+        The effects are standard normal and are integrated out with trust, so they have no columns.
         """
         return None
 
     # --- shared by all models ---
 
     def layout(self, observations: Observations, *, contrasts: bool = True) -> Layout:
-        """Arrange rates in blocks; unless `contrasts` is true, each row is one robot's rate."""
+        """Arrange rates in blocks; if `contrasts` is false, each row is the rate of one robot."""
         return Layout.from_rates(
             observations.contact_rate,
             joint=self.joint,
@@ -180,7 +180,7 @@ class TrustModel(Summary, ABC):
         return {name: float(getattr(self.priors, name)) for name in ("x0_mean", "x0_sd")}
 
     def all_hyperpriors(self, observations: Observations) -> dict[str, Distribution]:
-        """Return the priors on all hyperparameters by name, with those of effects last."""
+        """Return the priors on all hyperparameters by name; those of effects come last."""
         priors = self.hyperpriors(observations.n_robots, observations.awareness.shape[3])
         return priors | {n: p for e in self.effects for n, p in e.hyperpriors().items()}
 
@@ -193,7 +193,8 @@ class TrustModel(Summary, ABC):
         """Convert hyperparameters, named as in `all_hyperpriors`, to `theta` of `state_space`.
 
         Noise with standard deviation `resolution` is added to `delta_v` in quadrature. Without this
-        noise, the density of rates that fit perfectly, such as constant rates, would be unbounded.
+        noise, the density of rates that can be fitted perfectly, such as constant rates, would be
+        unbounded.
         """
         if self.likelihood.adds_noise:
             noise = values["delta_v"]
@@ -202,7 +203,7 @@ class TrustModel(Summary, ABC):
         return self.derived(values)
 
     def noise_without(self, delta_v: np.ndarray, resolution: float) -> np.ndarray:
-        """Return the `delta_v` that has the prior, given one to which `theta` added noise."""
+        """Undo `theta`: return the `delta_v` to which the prior applies, without added noise."""
         if not self.likelihood.adds_noise:
             return delta_v
 
@@ -243,9 +244,9 @@ class TrustModel(Summary, ABC):
     def program(self, observations: Observations) -> None:
         """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.
 
-        All variables are sampled, except that trust is integrated out if rates are Gaussian. Call
-        this method within `jax.enable_x64(True)`; effects need float64. As in `fit`, default priors
-        are those for the features.
+        All variables are sampled, but trust is integrated out if rates are Gaussian. Call this
+        method within `jax.enable_x64(True)`, because effects need float64. As in `fit`, the default
+        priors depend on the features.
         """
         of_features = self.for_features(observations.features)
         if of_features.priors is not self.priors:
@@ -311,7 +312,7 @@ class TrustModel(Summary, ABC):
         ]
 
     def _rows_of_priors(self) -> Rows:
-        """Return the priors that the model uses; those of its effects are in the effects."""
+        """Return the priors that the model uses; those of effects are listed with the effects."""
         hyperpriors = self.hyperpriors(2, 1)
         used = {"beta", "b", "x0_mean", "x0_sd", *hyperpriors}
         used |= {_PRIOR_OF[name] for name in hyperpriors if name in _PRIOR_OF}
@@ -328,7 +329,7 @@ class TrustModel(Summary, ABC):
                 of_limit = self.priors.stationary and name in ("beta", "b")
                 rows.append((f"prior of {name}{' / (1 - beta0)' * of_limit}", text))
 
-        options = self.options()  # show their own priors, if any
+        options = self.options()  # options show their own priors, if any
         return [
             *rows,
             *((f"prior of {n}", as_text(hyperpriors[n])) for n in own if n not in options),

@@ -32,7 +32,7 @@ class Observations(NamedTuple):
     """Number of ticks, shape (mission, bound, robot); NaN in the padding and where unknown."""
     features: tuple[str, ...] = ()
     visited: Visited | None = None
-    """Places of the bounds, if an effect needs them."""
+    """Places of the bounds, or None if no effect needs them."""
 
     @classmethod
     def from_missions(cls, missions: Sequence[Mission]) -> Self:

@@ -34,7 +34,7 @@ class ParameterDraws(Summary, Draws):
     SUM: ClassVar[str]
     """Subscripts of the `np.einsum` call that sums weights times awareness."""
     BY_ROBOT: ClassVar[bool] = False
-    """Whether coefficients differ between robots, so that b has the axis (robot,)."""
+    """Whether coefficients differ between robots; if so, b has the axis (robot,)."""
     place_robot: RobotsInBounds | None
     _fields: ClassVar[tuple[str, ...]]
 
@@ -47,7 +47,7 @@ class ParameterDraws(Summary, Draws):
 
     @property
     def by_name(self) -> dict[str, Numbers]:
-        """Arrays by name, without fields that are None."""
+        """Arrays by name, excluding fields that are None."""
         names = [name for name in self._fields if name not in ("memory", "place_robot")]
         values = {name: getattr(self, name) for name in names}
         return {name: value for name, value in values.items() if value is not None}
@@ -142,7 +142,7 @@ class ParameterDraws(Summary, Draws):
         b = np.asarray(self.b, dtype=float)  # pyright: ignore[reportAttributeAccessIssue]
         if not self.BY_ROBOT:
             b = b[..., None]
-        u += b.reshape(*b.shape, *(1,) * axes)  # in place, because the array can be large
+        u += b.reshape(*b.shape, *(1,) * axes)  # in place, because the array may be large
 
         if bounds is not None:
             return u + self.of_places(bounds) if self.places else u
@@ -163,7 +163,7 @@ class ParameterDraws(Summary, Draws):
         return u
 
     def team_inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
-        """See `Draws.team_inputs`; weights that robots share apply to their mean awareness."""
+        """See `Draws.team_inputs`; shared weights are applied to the robots' mean awareness."""
         if len(awareness) > 1 and not self.BY_ROBOT:
             awareness = awareness.mean(0, keepdims=True)
         return super().team_inputs(awareness, bounds)
@@ -214,7 +214,7 @@ class ParameterDraws(Summary, Draws):
         return flat._with_robots(RobotsInBounds.flat)
 
     def _with_robots(self, change: Callable[[RobotsInBounds], RobotsInBounds]) -> Self:
-        """Return the parameters after a change of the effects of robots in bounds, if any."""
+        """Return the parameters with changed effects of robots in bounds, if there are any."""
         if self.place_robot is None:
             return self
         return self._replace(place_robot=change(self.place_robot))  # pyright: ignore[reportAttributeAccessIssue]
@@ -264,7 +264,7 @@ class TrustParams(ParameterDraws, _Trust):
             ordered as in `workspace.MOVES`.
         memory: Quantity carried over between bounds, `"level"` or `"deviation"`; see `PooledTrust`.
         delta_s: Standard deviation of the noise that all robots share, shape (...,), or None.
-        place_robot: Effects of robots in bounds, in forecasts of the default model, or None.
+        place_robot: Effects of robots in bounds, used in forecasts of the default model, or None.
 
     Example:
         >>> beta = np.array([0.1, 0.1, 0.3])  # of traversability, visibility and line of sight
@@ -326,9 +326,9 @@ class CoupledParams(ParameterDraws, _Coupled):
     place_bound and place_robot are the same as in `TrustParams`.
 
     Example:
-        >>> posterior = tb.fit(missions, tb.models.CoupledTrust())
-        >>> params = tb.inference.params_of(posterior)
-        >>> params.B0.mean(axis=0)  # influence of each robot on each other one
+        >>> posterior = tb.fit(missions, tb.models.CoupledTrust()) >>> params =
+        tb.inference.params_of(posterior) >>> params.B0.mean(axis=0) # influence of each robot on
+        each other robot
     """
 
     __slots__ = ()
@@ -360,7 +360,7 @@ COUPLED_NAMES = CoupledParams._fields[:5]
 """Parameters of the coupled model, excluding x0 and place effects."""
 _POOLED_NAMES = TrustParams._fields[:5]
 
-_MOST_SHOWN = 6  # numbers of a field that a summary shows; of longer fields, it shows the range
+_MOST_SHOWN = 6  # largest number of values that a summary shows; longer fields are shown as a range
 
 
 def assemble_params(
@@ -384,9 +384,9 @@ def assemble_params(
 
 
 def require_values(params: Params) -> None:
-    """Raise TrustboError for a value that is not a number, infinite or beyond 1e12.
+    """Raise TrustboError for a value that is not a number, is infinite or exceeds 1e12.
 
-    Place effects may be NaN, where a map has no bound.
+    Place effects may be NaN where a map has no bound.
     """
     for field, value in params.by_name.items():
         require_numbers(f"params.{field}", value, missing=field in PLACES)
@@ -407,7 +407,7 @@ def require_covariances(params: Params) -> None:
 
 
 def require_shapes(params: Params, n_robots: int | None, n_features: int) -> None:
-    """Raise TrustboError unless shapes match `n_features` and, unless None, `n_robots`."""
+    """Raise TrustboError unless shapes match `n_features` and, if it is not None, `n_robots`."""
     n = params.n_robots if n_robots is None else n_robots
     sizes = {"feature": {n_features}, "robot": {n}, "robot_": {n}, "effect": {1, n}}
 

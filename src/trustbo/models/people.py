@@ -1,4 +1,4 @@
-"""Self-reported trust of people, modelled as in `PooledTrust` with outcomes as inputs."""
+"""Self-reported trust of people, modelled as in `PooledTrust`, with outcomes as inputs."""
 
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -38,15 +38,16 @@ class HumanTrust(PooledTrust):
         d^k = beta0 d^{k-1} + gains . inputs^k + delta_w w^k,    d^0 = 0
 
     The personal start enters d^1, and personal gains enter d^k. Start, level and gains are
-    independent, with mean 0 and standard deviations tau_start, tau_level and tau_gain. A person has
-    only one mission, so these coefficients are part of the covariance of trust and have no columns.
-    Inputs are outcomes: features whose names begin with `success` or `failure`, possibly scaled by
-    task demands. A person is stored as a mission, a step as a bound, and a rated task as a robot,
-    as in `trustbo.logs.read_reports`.
+    independent, with mean 0 and standard deviations tau_start, tau_level and tau_gain. Since each
+    person has only one mission, these coefficients are part of the covariance of trust and have no
+    columns. Inputs are outcomes: features whose names begin with `success` or `failure`, possibly
+    scaled by task demands. A person is stored as a mission, a step as a bound, and a rated task as
+    a robot, as in `trustbo.logs.read_reports`.
 
     Attributes:
         scale: `"unit"` for numbers in [0, 1], censored at 0 and 1; or, for example, `"likert7"` for
-            seven levels, with cut points halfway between levels and logistic noise with sd delta_v.
+            seven levels, with cut points halfway between the levels and logistic noise with sd
+            delta_v.
         tau_start: Scale of the half-normal prior on the standard deviation of personal starts.
         tau_level: Scale of the half-normal prior on the standard deviation of personal levels.
         tau_gain: Scale of the half-normal prior on the standard deviation of personal gains.
@@ -94,7 +95,7 @@ class HumanTrust(PooledTrust):
         return Levels(levels) if levels else FAMILIES["censored"]
 
     def observations(self, missions: Any, workspace: Any = None) -> Observations:
-        """See `TrustModel.observations`; raises TrustboError if the reports have another scale."""
+        """See `TrustModel.observations`; raise TrustboError if the scale of the reports differs."""
         observations = super().observations(missions, workspace)
 
         levels = levels_of(self.scale)
@@ -123,7 +124,7 @@ class HumanTrust(PooledTrust):
         return False
 
     def carried(self, observations: Observations) -> np.ndarray:
-        """See `TrustModel.carried`; outcomes are carried over, and the base level is not."""
+        """See `TrustModel.carried`; outcomes are carried over, but the base level is not."""
         outcomes = [name.startswith((SUCCESS, FAILURE)) for name in observations.features]
         return np.array([*outcomes, False])
 

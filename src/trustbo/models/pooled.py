@@ -21,7 +21,7 @@ from trustbo.statespace.form import independent_robots
 class PooledTrust(TrustModel):
     """Model with one set of parameters for all robots, equations (3)-(4).
 
-    Trust x_k in a robot and its contact rate y_k in bound k are ::
+    The trust x_k in a robot and its contact rate y_k in bound k are ::
 
         x_k = beta0 x_{k-1} + beta . z_k + b + delta_w w_k
         y_k = x_k + delta_v v_k
@@ -85,7 +85,7 @@ class PooledTrust(TrustModel):
         return self.memory == "level"
 
     def state_space(self, theta: Theta, n_robots: int) -> StateSpace:
-        """See `TrustModel.state_space`; a deviation from the mean has mean 0 at first."""
+        """See `TrustModel.state_space`; a deviation from the mean initially has mean 0."""
         return independent_robots(
             theta["beta0"],
             theta["delta_w"],

@@ -34,7 +34,7 @@ _MIDDLE = 0.5
 
 
 def _built(kind: Any, *parameters: float) -> Distribution:
-    """Make a float64 distribution on demand, because importing trustbo must create no JAX array."""
+    """Make a float64 distribution on demand, as importing trustbo must not create JAX arrays."""
     with own_settings():
         return kind(*parameters)
 
@@ -44,8 +44,8 @@ class Priors(Summary):
     """Priors on the parameters, as scalar NumPyro distributions, and on initial trust.
 
     The paper does not specify the prior on initial trust; the default is x_0 ~ N(0.5, 0.5^2).
-    Models ignore the priors on parameters that they do not have. Weights are integrated out and
-    need Normal priors; beta0 and noise scales need priors with quantiles (icdf).
+    Models ignore the priors on parameters that they do not have. Weights need Normal priors,
+    because they are integrated out; beta0 and the noise scales need priors with quantiles (icdf).
 
     Attributes:
         beta0: Autoregression coefficient, or the diagonal of B0 in the coupled model.
@@ -106,7 +106,7 @@ class Priors(Summary):
     @classmethod
     @cache
     def default(cls, family: str) -> "Priors":
-        """Return the default priors for an observation family, as the same object in every call.
+        """Return the default priors for an observation family; each call returns the same object.
 
         The family `"beta_binomial"` has wider priors because trust is a logit: beta_m ~ N(0, 2^2),
         b ~ N(0, 1), delta_w ~ HalfNormal(0.5) and x_0 ~ N(0, 1.5^2).
@@ -120,11 +120,11 @@ class Priors(Summary):
         """Return the default priors for features with the given names.
 
         The feature `line_of_sight` predicts the contact rate. Stationary trust therefore has prior
-        slope 1 in this feature, or in the mean of n such features (`line_of_sight_1`, ...). Their
-        weights, divided by 1 - beta0, have the prior N(1 / n, 0.3^2 / n), other weights N(0,
-        0.25^2), and the intercept N(0, 0.15^2). Most rates drawn from these priors are in [0, 1].
-        For tick counts, the priors are scaled by 5, and a line of sight of 0.5 predicts a rate of
-        0.5. Without line of sight, the result is `default`.
+        slope 1 in this feature, or in the mean of n such features (`line_of_sight_1`, ...). Divided
+        by 1 - beta0, the weights of these features have the prior N(1 / n, 0.3^2 / n), other
+        weights have N(0, 0.25^2), and the intercept has N(0, 0.15^2). Most rates drawn from these
+        priors are in [0, 1]. For tick counts, the priors are scaled by 5, and a line of sight of
+        0.5 predicts a rate of 0.5. If there is no such feature, `default` is returned.
         """
         features = require_list("features", features, str, "give the names of the features")
         require_choice("family", family, FAMILIES)
@@ -150,13 +150,13 @@ class Priors(Summary):
         """Return priors for awareness of cells without line of sight, on the scale of contact.
 
         No feature predicts the contact rate, so stationary trust is 0.5 in expectation, whatever
-        the awareness. Weights divided by 1 - beta0 have the prior N(0, 0.25^2), so that each may
-        have either sign, and the intercept N(0.5, 0.15^2). These are the standard deviations that
+        the awareness. Divided by 1 - beta0, the weights have the prior N(0, 0.25^2), which allows
+        either sign, and the intercept has N(0.5, 0.15^2). These are the standard deviations that
         `from_features` uses for features other than line of sight. For tick counts, the priors are
-        scaled by 5, and a trust of 0 is a rate of 0.5.
+        scaled by 5, and a trust of 0 corresponds to a rate of 0.5.
 
-        On the terrain of the notebook of the paper, 81 % of the contact rates drawn from these
-        priors are in [0, 1], and 22 % of those drawn from `default`.
+        On the terrain of the paper's notebook, 81 % of the contact rates drawn from these priors
+        are in [0, 1], compared with 22 % of those drawn from `default`.
         """
         require_choice("family", family, FAMILIES)
         slope, zero = FAMILIES[family].line_of_sight
@@ -192,7 +192,7 @@ class Priors(Summary):
         if not self.stationary or name not in ("beta", "b"):
             return log_density(prior, values)
 
-        # The density of `values` is that of the stationary coefficient times the Jacobian.
+        # The density of `values` is the density of the stationary coefficients times the Jacobian.
         return log_density(prior, values / inverse_gain) - np.log(inverse_gain)
 
     def describe(self) -> dict[str, str]:

@@ -12,7 +12,7 @@ from trustbo.models.priors import Priors
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
-    """Convert the class, options and effects of a model, and its priors as text, to a dict.
+    """Convert a model to a dict of its class, options and effects, and of its priors as text.
 
     The entry `by_feature` is true if the priors depend on the feature names.
     """
@@ -42,8 +42,8 @@ def model_from_record(
             )
         return given
 
-    # The priors are default if one of these models has the record: `Priors.default` (the object
-    # itself, which stands for priors by feature), equal priors as another object,
+    # The priors are default priors if one of the following gives the same record: `Priors.default`
+    # (the object itself, which stands for priors by feature), equal priors in another object,
     # `Priors.from_features` or `Priors.for_cells`.
     default = with_default_priors(record)
     of_features = Priors.from_features(features, record["family"])

@@ -1,4 +1,4 @@
-"""Effects of robots in bounds, drawn where they are needed."""
+"""Effects of robots in bounds, which are drawn when they are needed."""
 
 from typing import Any, NamedTuple, Self
 
@@ -7,16 +7,17 @@ from scipy.special import ndtri
 
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _MIX = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
-_ONE = 2.0**-53  # distance of the uniform numbers
+_ONE = 2.0**-53  # spacing of the uniform numbers
 
 
 class RobotsInBounds(NamedTuple):
     """Effects r of robots in the directed bounds of a map, which sum to 0 over robots.
 
-    In visited bounds, they are posterior draws. In all others, they are independent draws of the
-    prior, tau_r (n_i - mean n) with standard normal n_i for robot i. An array of the draws in all
-    bounds would be larger than the other parameters together, by the number of robots. Therefore,
-    n_i is computed from the numbers of the draw, the robot and the bound, when it is needed.
+    In visited bounds, the effects are posterior draws. In all other bounds, they are independent
+    draws from the prior, tau_r (n_i - mean n) with standard normal n_i for robot i. An array of the
+    draws in all bounds would be larger than all other parameters together, by a factor equal to the
+    number of robots. Therefore, n_i is computed from the numbers of the draw, the robot and the
+    bound when it is needed.
 
     Attributes:
         known: Effects in visited bounds, shape (..., robot, visited).
@@ -33,7 +34,7 @@ class RobotsInBounds(NamedTuple):
     seed: int
 
     def at(self, bounds: np.ndarray) -> np.ndarray:
-        """Return the effects (..., robot, bound) in some bounds; those of move -1 are 0.
+        """Return the effects (..., robot, bound) in the given bounds; for move -1, they are 0.
 
         Args:
             bounds: Moves, rows and columns, shape (bound, 3).

@@ -4,11 +4,11 @@ A score is standard normal a priori, except for pairs of standard deviations tha
 variance, such as the two noises. Their half-normal scores are (a, b) = size (sin(angle),
 cos(angle)), and the coordinates are log size and a normal score of the angle. The data usually
 determine the size well, but often not the angle. In these coordinates, a standard deviation that
-may be 0 has a light tail, like the prior; its own score would have a long one.
+may be 0 has a light tail, like the prior; its own score would have a long tail.
 
-If the data determine only the product of a and a factor of other hyperparameters, the product
-takes the place of a. For example, a Gaussian process with a long length scale and a large standard
-deviation differs little between neighbours.
+If the data determine only the product of a and a factor that depends on other hyperparameters, this
+product replaces a. For example, a Gaussian process with a long length scale differs little between
+neighbours, even if its standard deviation is large.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -36,25 +36,26 @@ _LARGEST_P = 1.0 - 1e-16
 
 
 class Pair(NamedTuple):
-    """Two standard deviations whose common size is a coordinate."""
+    """Pair of standard deviations whose common size is a coordinate."""
 
     first: str
     second: str
     given: str = ""
-    """Hyperparameter on which the factor of the first one depends, if there is a factor."""
+    """Hyperparameter on which the factor of the first standard deviation depends; empty without
+    one."""
     factor: Callable[[Any], Any] = np.ones_like
-    """Function of `given` (point, 1) that multiplies the first one."""
+    """Function of `given` (point, 1) that multiplies the first standard deviation."""
 
 
 class NormalScores:
     """Conversion between scores (point, score) and hyperparameters with independent priors."""
 
     def __init__(self, priors: Mapping[str, Distribution], pairs: Sequence[Pair] = ()) -> None:
-        """Set the priors; scores have the same order.
+        """Set the priors; the scores have the same order.
 
         Args:
             priors: Scalar or vector priors by name, which include the two noises.
-            pairs: Pairs of standard deviations, besides the noises, that have a common size.
+            pairs: Pairs of standard deviations that have a common size, in addition to the noises.
         """
         self.priors = dict(priors)
         self.pairs = (Pair(*NOISES), *pairs)
@@ -147,8 +148,8 @@ class NormalScores:
         n_others = z.shape[1] - log_size.shape[1]
         total = -0.5 * ((z**2).sum(1) - (log_size**2).sum(1)) - n_others * _LOG_ROOT_2PI
 
-        # In polar coordinates, the density of half-normal scores (a, b) has the factor size. The
-        # Jacobian of the log size is another factor size.
+        # In polar coordinates, the density of half-normal scores (a, b) contains the size as a
+        # factor. The Jacobian of the log size is the size once more.
         total = total + 2.0 * log_size.sum(1)
         for pair in self.pairs:
             squares = sum((a**2).sum(1) for a in self._half_normal(pair, z).values())
@@ -251,7 +252,7 @@ def _base(prior: Any) -> Any:
 
 
 def _by_numpyro(prior: Distribution, p: np.ndarray, name: str) -> np.ndarray:
-    """Compute quantiles with NumPyro; raises TrustboError if the prior on `name` has none."""
+    """Compute quantiles with NumPyro; raise TrustboError if the prior on `name` has none."""
     try:
         with own_settings():
             inside = jnp.asarray(np.clip(p, _SMALLEST_P, _LARGEST_P))

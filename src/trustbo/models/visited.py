@@ -9,11 +9,11 @@ from trustbo.data import Mission, require_map
 from trustbo.errors import TrustboError
 from trustbo.workspace.moves import bounds_along
 
-_MOST = 4000  # maximum number of visited bounds; the cost grows with the cube of the number
+_MOST = 4000  # maximum number of visited bounds, because the cost grows with its cube
 
 
 class Visited(NamedTuple):
-    """Cells entered and directed bounds driven in missions, without duplicates.
+    """Cells that missions entered and directed bounds that they took, without duplicates.
 
     Places are sorted by map, row and column. Map 0 is that of the workspace.
     """
@@ -37,7 +37,7 @@ class Visited(NamedTuple):
 def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None) -> np.ndarray:
     """Return an array (mission, bound, 3) of moves, rows and columns, with -1 in the padding.
 
-    `shape` contains the numbers of missions and bounds, by default those of `missions`. Raises
+    `shape` contains the numbers of missions and bounds; the default is that of `missions`. Raises
     TrustboError if a path skips cells or a mission has no map.
     """
     require_map("a model with place effects", missions)
@@ -78,9 +78,9 @@ def visited(
 ) -> Visited:
     """Index the places of bounds (mission, bound, 3); see `bounds_of`.
 
-    `shape` is the shape of the workspace's grid, by default ending at the last row and column
-    visited. `maps` (mission,) are the numbers of the maps, by default 0. Raises TrustboError if a
-    cell is outside the grid, or if the missions visited more than 4000 bounds.
+    `shape` is the shape of the workspace's grid; by default, the grid ends at the last row and
+    column visited. `maps` (mission,) contains the numbers of the maps, by default 0. Raises
+    TrustboError if a cell is outside the grid, or if the missions visited more than 4000 bounds.
     """
     if maps is None:
         maps = np.zeros(len(bounds), dtype=int)

@@ -37,7 +37,7 @@ EFFECTS: dict[str, type["Effect"]] = {}
 
 
 class Chains(NamedTuple):
-    """Prior on coefficients c[chain, mission] that are sums of a lasting and an independent part.
+    """Prior on coefficients c[chain, mission], each the sum of a lasting and an independent part.
 
     The lasting part is a stationary first-order autoregression over missions.
     """
@@ -50,9 +50,9 @@ class Chains(NamedTuple):
 class Effect:
     """Base class of an effect on the drift, with the settings of its prior.
 
-    By default, hyperparameters are standard deviations with half-normal priors, whose scales are
-    given by the fields of the same names. Override `hyperpriors` for other priors. Classes with a
-    `group` can be read from files.
+    By default, hyperparameters are standard deviations with half-normal priors. The fields of the
+    same names are the scales of these priors. Override `hyperpriors` for other priors. Classes with
+    a `group` can be read from files.
 
     Raises:
         TrustboError: If a prior scale is not positive.
@@ -67,7 +67,7 @@ class Effect:
     names: ClassVar[tuple[str, ...]] = ()
     """Names of the hyperparameters."""
     group: ClassVar[str] = ""
-    """Plural noun for what has the effect; also the name of the group in a posterior."""
+    """Plural name of the objects with the effect; also the name of the group in a posterior."""
     variables: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     """Axes of each variable of the effect by name, after (chain, draw)."""
     coords: ClassVar[Mapping[str, Sequence[Any]]] = {}
@@ -102,7 +102,8 @@ class Effect:
     def chains(self, theta: Theta, observations: Observations) -> Chains | None:
         """Return the same prior in the form of `Chains`, if it has this form.
 
-        With many missions, this form is faster. The mission varies fastest among the columns.
+        This form is faster if there are many missions. In the order of the columns, the mission
+        varies fastest.
         """
         return None
 
@@ -119,7 +120,8 @@ class Effect:
     ) -> np.ndarray:
         """Return the effect (draw, robot) on drift per unit of line of sight after n missions.
 
-        The effect is drawn if `rng` is given, otherwise expected. By default, the effect is 0.
+        If `rng` is given, the effect is drawn at random; otherwise, its expected value is returned.
+        By default, the effect is 0.
         """
         return np.zeros((len(theta["inverse_gain"]), 1))
 
@@ -129,7 +131,8 @@ class Effect:
 
     @property
     def pairs(self) -> list[Pair]:
-        """Pair of standard deviations that add to the same variance, if there is one.
+        """List with the pair of standard deviations that add up to one variance, if there is a
+        pair.
 
         Samplers then use their common size as a coordinate; see `scores`.
         """

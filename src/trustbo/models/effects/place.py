@@ -21,7 +21,7 @@ from trustbo.statespace.matrices import namespace
 from trustbo.workspace import Workspace
 
 _JITTER = 1e-8  # added to the correlation matrix of cells
-_LENGTH_SCALES = (1e-6, 1e6)  # limits in cells, at which cells are independent or equal
+_LENGTH_SCALES = (1e-6, 1e6)  # limits in cells, where cells are independent or equal
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class PlaceEffect(Effect):
     effects r_i of robots in a bound sum to 0 over the robots: for n robots, they have the
     covariance tau_r^2 (I - 1/n).
 
-    Awareness is wrong for each robot in its own way, and equally so each time that a bound is
-    driven. Without r_i, these errors would look like independent noise, and bounds that are driven
-    again and again would seem to prove wrong weights. Plans leave out r_i, whose mean over the team
-    is 0; forecasts and the trust in single robots include it.
+    The errors of awareness differ between robots, and they are the same each time that the robots
+    drive a bound. Without r_i, these errors would look like independent noise, and bounds that are
+    driven repeatedly would seem to be strong evidence for wrong weights. Plans leave out r_i, whose
+    mean over the team is 0; forecasts and the trust in single robots include r_i.
 
-    Missions on another map (see `Mission.map`) have other places, whose effects are independent of
-    those of the workspace, with the same standard deviations and length scale.
+    Missions on another map (see `Mission.map`) have other places. The effects of these places are
+    independent of those of the workspace, but have the same standard deviations and length scale.
 
     Attributes:
         tau_s: Scale of the half-normal prior on the standard deviation of s.
@@ -68,7 +68,7 @@ class PlaceEffect(Effect):
     length_scale_sd: float = 0.5
     names = ("tau_s", "length_scale", "tau_e", "tau_r")
     group = "places"
-    # The axes are in `place_maps.place_group`.
+    # The axes are defined in `place_maps.place_group`.
     variables: ClassVar = {"place": (), "place_bound": (), "place_robot": ()}
 
     def __post_init__(self) -> None:
@@ -83,7 +83,7 @@ class PlaceEffect(Effect):
 
     @property
     def pairs(self) -> list[Pair]:
-        """See `Effect.pairs`; data mostly determine how s differs between neighbouring cells."""
+        """See `Effect.pairs`; data mostly determine differences of s between neighbours."""
         return [Pair("tau_s", "tau_e", "length_scale", _sd_given_neighbour)]
 
     def add_data(
@@ -137,7 +137,7 @@ class PlaceEffect(Effect):
         """Compute the precision (point, cell, cell) of s from squared distances (cell, cell)."""
         xp: Any = namespace(theta["tau_s"])
 
-        # Squared distances have few different values, for which the correlation is computed once.
+        # Squared distances take few distinct values, so the correlation is computed once for each.
         distance = np.sqrt(np.arange(square.max(initial=0) + 1.0))
         scale = xp.clip(theta["length_scale"], *_LENGTH_SCALES)
         K = matern(distance, scale[:, None])[:, square]

@@ -2,7 +2,7 @@
 
 For example, damage to a detector has a lasting effect, but rain does not. The stationary trust of
 robot i in mission m has the additional term l d[i, m], where l is the predicted line of sight. The
-effect d is independent between robots and has the following covariance over missions:
+effects d of different robots are independent. Over missions, they have the covariance
 
     cov(d[i, m], d[i, m']) = tau_slow^2 rho^|m - m'| + tau_mission^2 [m = m'].
 """
@@ -65,7 +65,7 @@ class RobotEffect(Effect):
         )
 
     def prior(self, theta: Theta, observations: Observations) -> tuple[Any, list[Any]]:
-        """Return independent priors for the robots, as one array if their gain is the same."""
+        """Return independent priors for the robots, as a single array if their gain is equal."""
         inverse_gain = theta["inverse_gain"]
         slow, mission = self._variances(theta)
         value, vector = _correlation_eigen(self.rho, observations.n_missions)
@@ -96,7 +96,7 @@ class RobotEffect(Effect):
     ) -> np.ndarray:
         """See `Effect.predict_next`; the next effect d is drawn given d in all n missions.
 
-        Without any mission, it is drawn from the prior.
+        If there are no missions, it is drawn from the prior.
         """
         C = self._covariance(theta, n)
         slow = np.maximum(theta["tau_slow"], LEAST) ** 2

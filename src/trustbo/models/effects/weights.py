@@ -69,7 +69,8 @@ class RobotWeights(Weights):
         return namespace(mean).repeat(mean, n, axis=1), parts
 
     def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
-        """Return the weights `beta` (draw, robot, feature), intercepts `b` (draw, robot) and means.
+        """Return weights `beta` (draw, robot, feature), intercepts `b` (draw, robot) and their
+        means.
 
         The means `mean_beta` and `mean_b` are expected values given the coefficients.
         """
@@ -90,7 +91,7 @@ class RobotWeights(Weights):
 
 @dataclass(frozen=True)
 class CoupledWeights(Weights):
-    """Matrices B_m that weight feature m of robot l in the trust of robot i, and intercepts b_i."""
+    """Weights B_m of feature m of robot l in the trust of robot i, and intercepts b_i."""
 
     def design(self, observations: Observations) -> Any:
         """Return the features of all robots and a constant 1, for each robot."""

@@ -17,7 +17,7 @@ from trustbo.models.families.moments import draw_between_knots, log_normal, matc
 from trustbo.statespace.matrices import namespace
 
 _KNOTS = np.linspace(-5.0, 5.0, 21)  # knots of the proposal, in sds from the mean
-_LEAST = 1e-12  # smallest parameter of a beta distribution that is drawn from
+_LEAST = 1e-12  # smallest parameter of a beta distribution that draws are taken from
 _LEAST_VARIANCE = 1e-6  # limits the concentration
 
 

@@ -35,12 +35,12 @@ class Censored(Gaussian):
         return xp.where(y <= 0.0, log_ndtr(-trust / sd), beyond)
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """See `Family._match`; a rate of 0 or 1 only bounds the unclipped rate (Tobin 1958)."""
+        """See `Family._match`; a rate of 0 or 1 only limits the unclipped rate (Tobin 1958)."""
         cut, low, high = _limits(y)
         return np.where(cut, match_interval(low, high, m, v, sd), super()._match(y, N, m, v, sd))
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw the rate before clipping, and then the predictor given that rate, both exactly."""
+        """Draw the rate before clipping, then the predictor given this rate, both exactly."""
         cut, low, high = _limits(y)
         total = np.sqrt(v + sd**2)
         e = draw_between((low - m) / total, (high - m) / total, rng)

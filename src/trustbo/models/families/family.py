@@ -35,8 +35,8 @@ class Family(ABC):
     needs_ticks: ClassVar[bool] = False
     """Whether every measured rate needs a tick count."""
     adds_noise: ClassVar[bool] = True
-    """Whether a rate is the linear predictor plus noise with sd delta_v. The tick resolution then
-    adds to this noise, which may be correlated between robots."""
+    """Whether a rate is the linear predictor plus noise with sd delta_v. In that case, the tick
+    resolution adds to this noise, which may be correlated between robots."""
     expected_rate: ClassVar[str] = "identity"
     """Form of `mean_rate` in compiled planning: `"identity"` (trust itself), `"logistic"`, or
     `"clipped"` (a normal variable with sd delta_v, clipped to [0, 1])."""
@@ -57,9 +57,9 @@ class Family(ABC):
 
     @abstractmethod
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw f from N(f; m, v) times the likelihood of a rate; also return a log weight.
+        """Draw f from N(f; m, v) times the likelihood of a rate; return f and a log weight.
 
-        The mean weight is the mass of the product, and weights are constant if draws are exact.
+        The mean weight is the mass of the product. If draws are exact, the weights are constant.
         """
 
     def mean_rate(self, trust: Array, sd: Array) -> Array:
@@ -75,7 +75,7 @@ class Family(ABC):
         return {}
 
     def moment_match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
-        """Compute the moments of `_match`; where y is NaN, they are 0, m and v."""
+        """Compute the moments as in `_match`; where y is NaN, they are 0, m and v."""
         seen, arrays = _measured(y, N, m, v, sd)
         one, mean, var = self._match(*arrays)
         return np.where(seen, one, 0.0), np.where(seen, mean, m), np.where(seen, var, v)

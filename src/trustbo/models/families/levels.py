@@ -15,8 +15,9 @@ from trustbo.statespace.matrices import namespace
 _LEAST_P = 1e-300  # smallest probability of a report, so that its log is finite
 _SHARES = np.array([0.252201, 0.585225, 0.162574])
 _SDS = np.sqrt(3.0) / np.pi / np.array([0.90793, 0.577787, 0.364038])
-"""Weights and sds of a normal mixture within 1e-3 of a logistic distribution with sd 1, whose heavy
-tails allow for mistaken reports (Monahan and Stefanski 1992)."""
+"""Weights and sds of a normal mixture that is within 1e-3 of a logistic distribution with sd 1
+(Monahan and Stefanski 1992). The heavy tails of the logistic distribution allow for mistaken
+reports."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Levels(Family):
         return total, center, spread
 
     def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """Draw the mixture component, the report before rounding, and f, all exactly."""
+        """Draw the mixture component, the report before rounding and f; all draws are exact."""
         log_p = self._components(y, m, v, sd)[0]
         noise = _SDS[np.argmax(log_p + rng.gumbel(size=log_p.shape), axis=0)] * sd
 
