@@ -86,8 +86,8 @@ def fit_hazard(
         PosteriorError: If the k-hat of the importance weights exceeds 0.7.
 
     Example:
-        >>> hazard = tb.hazard.fit_hazard(missions, workspace) >>> hazard["p_fail"].max().item() #
-        for the most dangerous bound
+        >>> hazard = tb.hazard.fit_hazard(missions, workspace)
+        >>> hazard["p_fail"].max().item()  # of the most dangerous bound
     """
     started = time.perf_counter()
     hazard = hazard or Hazard()

@@ -203,7 +203,7 @@ class TrustModel(Summary, ABC):
         return self.derived(values)
 
     def noise_without(self, delta_v: np.ndarray, resolution: float) -> np.ndarray:
-        """Undo `theta`: return the `delta_v` to which the prior applies, without added noise."""
+        """Return `delta_v` without the noise that `theta` added, as the prior applies to it."""
         if not self.likelihood.adds_noise:
             return delta_v
 

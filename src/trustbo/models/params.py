@@ -326,9 +326,9 @@ class CoupledParams(ParameterDraws, _Coupled):
     place_bound and place_robot are the same as in `TrustParams`.
 
     Example:
-        >>> posterior = tb.fit(missions, tb.models.CoupledTrust()) >>> params =
-        tb.inference.params_of(posterior) >>> params.B0.mean(axis=0) # influence of each robot on
-        each other robot
+        >>> posterior = tb.fit(missions, tb.models.CoupledTrust())
+        >>> params = tb.inference.params_of(posterior)
+        >>> params.B0.mean(axis=0)  # influence of each robot on each other one
     """
 
     __slots__ = ()

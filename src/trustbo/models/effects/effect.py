@@ -131,8 +131,7 @@ class Effect:
 
     @property
     def pairs(self) -> list[Pair]:
-        """List with the pair of standard deviations that add up to one variance, if there is a
-        pair.
+        """The pair of standard deviations that add up to one variance, if there is one, in a list.
 
         Samplers then use their common size as a coordinate; see `scores`.
         """

@@ -69,8 +69,7 @@ class RobotWeights(Weights):
         return namespace(mean).repeat(mean, n, axis=1), parts
 
     def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
-        """Return weights `beta` (draw, robot, feature), intercepts `b` (draw, robot) and their
-        means.
+        """Return the weights `beta` (draw, robot, feature), intercepts `b` (draw, robot) and means.
 
         The means `mean_beta` and `mean_b` are expected values given the coefficients.
         """
