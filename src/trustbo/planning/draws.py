@@ -1,4 +1,4 @@
-"""Best path for each draw of a posterior, with the values, regrets and frequencies of paths."""
+"""Best path for each draw of a posterior, and the values, regrets and frequencies of paths."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class DrawnPaths:
 
     @cached_property
     def candidates(self) -> list[tuple[Cell, ...]]:
-        """Distinct best paths, starting with the most frequent one."""
+        """Distinct best paths, the most frequent one first."""
         return [self.problem.paths.cells(path) for path in self._distinct[0]]
 
     @property
@@ -60,8 +60,8 @@ class DrawnPaths:
     def relative_regret(self, path: Sequence[Cell]) -> np.ndarray:
         """Return the regret of a path relative to each draw's best value, shape (draw,).
 
-        For lost_contact, the regret is divided by the contact kept on the best path, which is the
-        number of bounds of that path minus the lost contact and the failure cost. For other
+        For lost_contact, the regret is divided by the contact that is kept on the best path: the
+        number of bounds of this path minus the lost contact and the failure cost. For other
         objectives, the regret is divided by the absolute best value. If the divisor is 0, a
         positive regret becomes infinite.
         """
@@ -101,7 +101,7 @@ class DrawnPaths:
 
 
 def choose_draws(params: Draws, n_draws: int | None, seed: int) -> Draws:
-    """Choose `n_draws` draws at random, or all draws if None; the leading axis is (draw,)."""
+    """Choose `n_draws` draws at random, or all draws if None. The leading axis is (draw,)."""
     seed = require_whole("seed", seed, 0)
     flat = params.flat()
     n = flat.leading[0]

@@ -1,9 +1,9 @@
-"""Label search on the unrolled graph, for objectives that are nonlinear in trust, or with a risk.
+"""Label search on the unrolled graph, for objectives that are nonlinear in trust or include risk.
 
 The method is a label-setting algorithm with dominance for the resource-constrained shortest path
-(Martins 1984; Irnich and Desaulniers 2005). A label at a state contains the cost so far, the sums
-r_m of the risks -log(1 - p) and, if the loss depends on trust, trust. An edge has a cost and
-possibly a loss, which decreases with trust. The cost of a path also includes
+(Martins 1984; Irnich and Desaulniers 2005). A label at a state contains the cost so far and the
+sums r_m of the risks -log(1 - p). If the loss depends on trust, a label also contains trust. An
+edge has a cost and possibly a loss, which decreases with trust. The cost of a path also includes
 sum_m F_m (1 - exp(-r_m)), and its failure probability sum_m w_m (1 - exp(-r_m)) must not exceed a
 limit.
 
@@ -12,10 +12,10 @@ trust. Because B0 >= 0 preserves the order of trust, any path to the goal is at 
 the other label. If U-turns are forbidden, the other label must come from the same cell, or there
 must be two such labels from different cells. A label is also dropped if no path that continues it
 can be better than the best path found so far. To check this, the remaining cost is bounded from
-below by a sum over edges, which uses the largest possible trust and the chord of
-F_m (1 - exp(-r_m)) over the sums that can still be optimal. The limit, with the chord of
-w_m (1 - exp(-r_m)), is relaxed with a Lagrange multiplier, found by bisection (Handler and Zang
-1980).
+below by a sum over edges. The sum uses the largest possible trust, and the chord of F_m (1 -
+exp(-r_m)) over the sums that can still be optimal. For the limit, w_m (1 - exp(-r_m)) is also
+replaced by its chord. The limit is then relaxed with a Lagrange multiplier, which is found by
+bisection (Handler and Zang 1980).
 
 The search is exact because no dropped label can lead to a better path than the one returned.
 """
@@ -31,7 +31,8 @@ from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, 
 from trustbo.workspace.moves import MOVES
 
 MAX_LABELS = 300_000
-"""Maximum number of labels. A larger search stops with the best path found and a lower limit."""
+"""Maximum number of labels. A search that needs more stops with the best path found so far and a
+lower limit."""
 LOGISTIC = 0
 """Loss of a bound 1 - sigma(trust)."""
 CLIPPED = 1
@@ -42,8 +43,8 @@ TINY_SD = 1e-9
 """Smallest standard deviation of a contact rate; smaller values are replaced."""
 _N_MOVES = len(MOVES)  # largest number of labels that extend one label
 _MAX_EXPONENT = 700.0  # exp(710) exceeds the range of a float
-_N_TANGENTS = 8  # most tangents to the failure cost; few are needed to find good paths
-_N_PRICES = 16  # most prices of the limit for which the dual is computed
+_N_TANGENTS = 8  # maximum number of tangents to the failure cost; few suffice to find good paths
+_N_PRICES = 16  # maximum number of prices of the limit for which the dual is computed
 _PRICE_TOLERANCE = 1e-9  # relative change below which the tangents have converged
 _NO_CELL_YET = -2  # differs from all cells and from -1, the cell before the start
 
@@ -51,13 +52,13 @@ _NO_CELL_YET = -2  # differs from all cells and from -1, the cell before the sta
 class Costs(NamedTuple):
     """Costs of paths for one draw.
 
-    `loss` is a value of `LOSSES`. A bound costs its loss plus `bound_cost` (bound,) minus `weight`
-    (n_bounds_left, robot) times `drift` (robot, bound). `start` (n_bounds_left,) is the constant
-    cost of paths with a given number of bounds. `transition` (robot, robot) and `x0` (robot,)
-    define the recursion for trust, or are empty if there is no loss. `sd` is the sd of a rate.
-    `risk` has the shape (edge, sum), because a risk depends on the bound before an edge, `failure`
-    (sum,) contains F_m, `share` (sum,) contains w_m, and `limit` is the largest failure probability
-    allowed.
+    `loss` is a value of `LOSSES`. The cost of a bound is its loss plus `bound_cost` (bound,) minus
+    `weight` (n_bounds_left, robot) times `drift` (robot, bound). `start` (n_bounds_left,) is the
+    constant cost of paths with a given number of bounds. `transition` (robot, robot) and `x0`
+    (robot,) define the recursion for trust, or are empty if there is no loss. `sd` is the sd of a
+    rate. `risk` has the shape (edge, sum), because a risk depends on the bound before an edge.
+    `failure` (sum,) contains F_m, `share` (sum,) contains w_m, and `limit` is the largest failure
+    probability allowed.
     """
 
     loss: int
@@ -81,8 +82,9 @@ def best_labels(
 
     Args:
         graph: Unrolled graph.
-        costs: Costs; drift, weight, start, transition, x0 and sd have a leading axis (draw,).
-        scale: Value by which the cost of a path with each number of bounds is divided, (length,).
+        costs: Costs, in which drift, weight, start, transition, x0 and sd have a leading axis
+            (draw,).
+        scale: Divisor of the cost of paths with each number of bounds, shape (length,).
 
     Returns:
         Costs (draw,), lower bounds on the cost of any path (draw,), and paths (draw, cell) as flat
@@ -182,7 +184,8 @@ def _least_costs(graph, costs, edge_cost):
 def _failing(weights, r):
     """Compute sum_m weights_m (1 - exp(-r_m)) for the sums r of the risks, shape (sum,).
 
-    This is the expected cost of failure if the weights are F_m, or its probability if they are w_m.
+    The sum is the expected cost of failure if the weights are F_m, and the failure probability if
+    they are w_m.
     """
     total = 0.0
     for m in range(len(r)):
@@ -263,8 +266,8 @@ class Limits(NamedTuple):
 
     `lower` is a lower bound on the cost of all paths. For each state, `free` (state,) is the
     smallest remaining cost, excluding the cost of failure, and `safest` (state, sum) is the
-    smallest sum of the remaining risks. `priced` (state,) plus `offset` plus `price` (sum,) times
-    the sums so far is a lower bound on the remaining cost, with failure and the relaxed limit.
+    smallest sum of the remaining risks. The remaining cost, including failure and the relaxed
+    limit, is at least `priced` (state,) plus `offset` plus `price` (sum,) times the sums so far.
     """
 
     lower: float
@@ -289,7 +292,7 @@ def _limits(graph, costs, edge_cost, least_cost, known):
         safest[:, m] = to_go.least
         low[m] = to_go.least[graph.starts].min()
 
-    if _is_beyond(costs, low):  # even if one path had all the smallest sums
+    if _is_beyond(costs, low):  # even a path with the smallest value of each sum
         unknown = np.full(len(graph.cell), np.inf)
         return Limits(np.inf, safest, unknown, unknown, np.zeros(n_sums), 0.0)
     if costs.limit < np.inf:
@@ -301,7 +304,8 @@ def _limits(graph, costs, edge_cost, least_cost, known):
     sums = known.sums.copy()
     _follow_tangents(graph, costs, edge_cost, least_cost, costs.failure, sums, to_go, known)
 
-    # With chords as prices, a sum over edges bounds the cost from below (see the module).
+    # With chords as prices, a sum over edges is a lower bound on the cost (see the module
+    # docstring).
     gap = known.cost[0] - least
     high = np.minimum(_highest(costs.failure, low, gap), _highest(costs.share, low, costs.limit))
     chord, offset = _chords(costs.failure, low, high)
@@ -321,7 +325,7 @@ def _limits(graph, costs, edge_cost, least_cost, known):
 def _follow_tangents(graph, costs, edge_cost, least_cost, weights, sums, to_go, known):
     """Try the cheapest paths for tangents to the concave sum_m weights_m (1 - exp(-r_m)).
 
-    The first tangent is the one at `sums`, the next one at the sums of the path found, and so on.
+    The first tangent is at `sums`, the next one at the sums of the path that was found, and so on.
     """
     price = np.zeros(len(weights))
     for _ in range(_N_TANGENTS):
@@ -344,7 +348,7 @@ def _highest(weights, low, most):
     at_low = _failing(weights, low)
     for m in range(len(low)):
         if weights[m] > 0.0:
-            # The other sums are at their lowest, so that this sum can be as large as possible.
+            # The other sums are at their minimum, so this sum is as large as possible.
             share = (most - at_low) / weights[m] - math.expm1(-low[m])
             if share < 1.0:
                 high[m] = -math.log1p(-max(share, 0.0))
@@ -539,14 +543,14 @@ def _is_hopeless(costs, limits, h, cost, sums, known):
     if _is_beyond(costs, smallest):
         return True
 
-    # A plane below the failure cost, with the limit relaxed.
+    # The first bound uses a plane below the failure cost and the relaxed limit.
     at_least = cost + limits.priced[h] + limits.offset
     for m in range(len(sums)):
         at_least += limits.price[m] * sums[m]
     if at_least >= known:
         return True
 
-    # The failure cost itself, at the smallest sums that can still be reached.
+    # The second bound uses the failure cost itself, at the smallest sums that can still be reached.
     return cost + limits.free[h] + _failing(costs.failure, smallest) >= known
 
 
@@ -575,7 +579,7 @@ def _is_dominated(graph, labels, label, other, n_sums):
     while other >= 0:
         covers = other != label
         equal = True
-        for k in range(len(number)):  # cost and sums should be small, trust large
+        for k in range(len(number)):  # smaller costs and sums are better, and larger trust
             a = labels.number[other, k]
             b = number[k]
             worse = a > b if k <= n_sums else a < b
@@ -584,7 +588,7 @@ def _is_dominated(graph, labels, label, other, n_sums):
                 break
             equal = equal and a == b
 
-        if covers and (not equal or other < label):  # of equal labels, the first remains
+        if covers and (not equal or other < label):  # the first of several equal labels remains
             came_from = labels.came_from[other]
             if graph.turns or came_from == labels.came_from[label]:
                 return True

@@ -1,4 +1,4 @@
-"""Objectives, which compute the value of a path from the team's expected trust along the path."""
+"""Objectives, which compute the value of a path from the team's expected trust along it."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -27,8 +27,8 @@ class Objective(NamedTuple):
 
         (sum_k credit(K - k) x_k - bound costs) / scale(K),
 
-    or, if `of_contact` is True, minus the sum of the expected lost contact and bound costs. To add
-    an objective, add an entry to `OBJECTIVES`; the searches need no change.
+    or, if `of_contact` is True, minus the sum of the expected lost contact and the bound costs. To
+    add an objective, add an entry to `OBJECTIVES`; the searches need no change.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Objective(NamedTuple):
     value: Callable[[Array], Array] = _same
     """Increasing function that maps the score to the reported value."""
     of_contact: bool = False
-    """Whether the value measures expected contact, so that failures have a cost in bounds."""
+    """Whether the value measures expected contact. If so, failures have a cost in bounds."""
     max_bounds: str = "shortest+2"
     """Default limit on the number of bounds."""
 
@@ -59,7 +59,7 @@ minus bound costs.
 
 
 class Weights(NamedTuple):
-    """Weights of the drifts of bounds in the score of a path, if the score is a sum over bounds."""
+    """Weights of the drifts in the score of a path, if the score is a sum over bounds."""
 
     per_bound: Array
     """Weight w_j of a bound with j bounds left after it, shape (draw, n_bounds_left, state)."""
@@ -118,8 +118,8 @@ def capped(objective: Objective, likelihood: Family, recursion: Recursion) -> Re
     """Cap the drift and the initial trust, so that trust never exceeds 1 and no rate exceeds 1.
 
     If the drift of each state is at most 1 minus the row sum of B0, B0 >= 0 and x_0 <= 1, trust is
-    at most 1. A loop then never increases the value. Only lost_contact with rates that are linear
-    in trust needs the cap; for other objectives or rates, the recursion is returned unchanged.
+    at most 1. A loop then never increases the value. The cap is needed only for lost_contact with
+    rates that are linear in trust; otherwise, the recursion is returned unchanged.
     """
     if not objective.of_contact or has_history(objective, likelihood):
         return recursion

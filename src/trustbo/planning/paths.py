@@ -55,7 +55,8 @@ class AdmissiblePaths:
         max_bounds: Limit on the number of bounds (see `Planner`).
         turns: Whether U-turns are allowed; True if `max_bounds` is a number.
         avoided: Mask (move, row, col) of the bounds that paths must avoid, or None.
-        blocked: Mask of the bounds that nobody can drive, or None; `avoiding` never allows these.
+        blocked: Mask of the bounds that cannot be driven, or None; `avoiding` never allows these
+            bounds.
         bounds: Mask (move, row, col) of bounds that a path may take, indexed by the cell entered.
         bounds_to_goal: Fewest bounds from each cell to the goal, (row, col); -1 if unreachable.
         shortest: Smallest number of bounds of a path.
@@ -122,7 +123,7 @@ class AdmissiblePaths:
             )
 
     def _remedy(self) -> str:
-        """Return what to do if no path leads to the goal, as a sentence."""
+        """Return a sentence with advice if no path leads to the goal."""
         if self.blocked is not None:
             return f"{int(self.blocked.sum())} bounds are blocked."
 
@@ -150,7 +151,8 @@ class AdmissiblePaths:
         far = self.bounds_to_goal.ravel()
         near = self.bounds_from_start.ravel()
 
-        # Count the possible numbers of bounds left in each cell: `far` or more, but 0 at the goal.
+        # Count the possible numbers of bounds left in each cell: `far` or more, except for 0 at the
+        # goal.
         n_left = np.maximum(np.where(far == 0, 1, self.longest - near - far + 1), 0)
         n_left[(far < 0) | (near < 0)] = 0
         n_states = int(n_left.sum())
@@ -174,7 +176,7 @@ class AdmissiblePaths:
 
         # Find the state to which each move leads from each state; -1 if there is no such state.
         head = np.full((n_states, n_moves), -1, np.int32)
-        for m, step in enumerate(STEPS @ (cols, 1)):  # no bound enters a cell across a border
+        for m, step in enumerate(STEPS @ (cols, 1)):  # no bound crosses the border of the grid
             is_inside = (cell + step >= 0) & (cell + step < rows * cols)
             tail = np.flatnonzero(is_inside & (n_bounds_left > 0))
             other = cell[tail] + step

@@ -1,4 +1,4 @@
-"""Plan: a path with its expected trust and value, and the routes of the robots."""
+"""A plan: a path with its expected trust and value, and the routes of the robots."""
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -35,16 +35,17 @@ class Plan(Summary):
         exact: Whether the search proved that no admissible path is better.
         limit: Upper limit on the value of any admissible path. The limit equals `value` if `exact`
             is True, and is NaN if the path was given.
-        revisits: Number of bounds that enter a cell that the path contains already.
+        revisits: Number of bounds that enter a cell that the path has already visited.
         seconds: Duration of the search in seconds.
         workspace: Workspace of the path.
-        risk: Failure probability of each bound, and the arrival probability with its 90 % band;
-            None if the planner has no risk.
+        risk: Failure probability of each bound, and arrival probability with its 90 % band; None if
+            the planner has no risk.
         infeasible: Whether the failure probability of the path exceeds `max_failure`.
-        blocked: Pairs of cells between which no bound can be driven in this mission; see
+        blocked: Pairs of cells between which the team cannot drive a bound in this mission; see
             `Campaign.replan`.
-        value_band: Ends of the 90 % band of the value over the draws, with the mean failure
-            probability; None with one draw. `value` limits trust to 1 and may lie outside.
+        value_band: Ends of the 90 % band of the value over the draws, computed with the mean
+            failure probability; None with one draw. `value` may lie outside the band, because it
+            limits trust to 1.
 
     Example:
         >>> plan = tb.Planner(workspace, (9, 0), (0, 9)).plan(posterior)

@@ -90,8 +90,8 @@ class Planner(Summary):
                 and n = 2 for the others. If n > 2, paths may revisit cells (see `Plan.revisits`).
             bound_cost: Additional cost of each bound (edge cost), such as its length or duration.
                 The array must broadcast to (move, row, col), with the moves of `workspace.MOVES`; a
-                DataArray is aligned by its dims and labels. The costs are in bounds for
-                lost_contact, and in units of trust for the other objectives.
+                DataArray is aligned by its dims and labels. Costs are in bounds for lost_contact,
+                and in units of trust for the other objectives.
             max_failure: Largest failure probability of a path, in [0, 1); by default, no limit.
             failure_cost: Cost of a failure in bounds, for lost_contact. The value is reduced by
                 this cost times the failure probability. The default is the smallest number of
@@ -99,9 +99,9 @@ class Planner(Summary):
             family: Name of the trust model's observation family, used only for lost_contact.
 
         Raises:
-            TrustboError: If the start or goal is off the grid or impassable, the start equals the
-                goal, `max_bounds` is too small, `bound_cost` has the wrong shape, a name is
-                unknown, or a number is out of range.
+            TrustboError: If the start or goal is off the grid or impassable; the start equals the
+                goal; `max_bounds` is too small; `bound_cost` has the wrong shape; a name is
+                unknown; or a number is out of range.
             NoPathError: If the goal cannot be reached from the start.
         """
         aim = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
@@ -158,22 +158,25 @@ class Planner(Summary):
         blocked: Sequence[Sequence[Cell]] = (),
         n_driven: int = 0,
     ) -> Self:
-        """Return a planner of the rest of a mission, from the cell in which the team is.
+        """Return a planner for the rest of a mission, from the current cell of the team.
 
-        The limits `max_failure` and, if it is a text, `max_bounds` apply to the rest alone. A risk
-        is kept, but bounds that are `avoiding` are not.
+        The limit `max_failure` applies to the rest of the mission alone, and so does `max_bounds`
+        if it is a string. A risk is kept, but the bounds that `avoiding` excluded are allowed
+        again.
 
         Args:
-            cell: Cell in which the lead is, or a position in it.
-            x0: Expected trust in this cell, shape () or (robot,), such as `Follower.trust.mean`; by
-                default `x0_mean` of the parameters.
-            blocked: Pairs of neighbouring cells. No path takes a bound between them, in either
-                direction.
-            n_driven: Number of bounds that were driven so far; if `max_bounds` is a number, it is
-                reduced by it, but never below the fewest bounds that lead to the goal.
+            cell: Current cell of the lead, or a position in it.
+            x0: Expected trust in this cell, shape () or (robot,), such as `Follower.trust.mean`.
+                The default is `x0_mean` of the parameters.
+            blocked: Pairs of neighbouring cells. No path takes a bound between the cells of a pair,
+                in either direction.
+            n_driven: Number of bounds that the team has driven so far. If `max_bounds` is a number,
+                `n_driven` is subtracted from it, but the result is never less than the fewest
+                bounds that lead to the goal.
 
         Raises:
-            TrustboError: If the cell is impassable or the goal, or a pair has no neighbours.
+            TrustboError: If the cell is impassable or is the goal, or if the cells of a pair are
+                not neighbours.
             NoPathError: If the goal cannot be reached.
 
         Example:
@@ -218,19 +221,19 @@ class Planner(Summary):
         draws: ArrayLike | None = None,
         components: Components | None = None,
     ) -> Self:
-        """Return a planner with the given failure probability of each bound, with each next move.
+        """Return a planner with the given failure probability of each bound and next move.
 
         With a risk, plans respect `max_failure` and have an arrival probability `p_arrive`. For
         lost_contact, the value of a plan includes the expected cost of failure.
 
         Args:
-            p_fail: Posterior mean, shape (move, row, col, next_move), with the end of the path as
-                the last next move, such as `BoundRisk.mean`; or shape (move, row, col), if the
+            p_fail: Posterior mean, such as `BoundRisk.mean`, shape (move, row, col, next_move),
+                where the last next move is the end of the path; or shape (move, row, col) if the
                 next move does not matter. NaN where there is no bound.
             draws: Posterior draws, with a leading axis (draw,), for `p_arrive` and its 90 % band.
-            components: Mean failure probabilities of groups of draws, such as
-                `BoundRisk.components()`, for the expected cost of failure, with a leading axis
-                (component,). By default, bounds fail independently with `p_fail`.
+            components: Mean failure probabilities of groups of draws, with a leading axis
+                (component,), such as `BoundRisk.components()`. They are used for the expected cost
+                of failure. By default, bounds fail independently with probability `p_fail`.
 
         Raises:
             TrustboError: If the shapes do not match, or a probability is outside [0, 1].
@@ -262,12 +265,12 @@ class Planner(Summary):
         Args:
             params: Posterior from `fit`, or parameters. If there are several draws, the path is
                 optimal for their mean, and the bands are quantiles over the draws.
-            x0: Expected trust at the start, shape () or (robot,), or by the names of the robots; by
-                default `params.x0_mean`.
+            x0: Expected trust at the start, shape () or (robot,), or labelled with the names of the
+                robots. The default is `params.x0_mean`.
 
         Raises:
-            TrustboError: If the robots or features of the parameters differ from the workspace's,
-                or beta0 is outside the range in which the search is exact.
+            TrustboError: If the robots or features of the parameters differ from those of the
+                workspace, or if beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
         started = time.perf_counter()
@@ -280,7 +283,7 @@ class Planner(Summary):
         return replace(plan, exact=exact, limit=limit, seconds=time.perf_counter() - started)
 
     def best_path(self, recursion: Recursion) -> tuple[Cell, ...]:
-        """Find the best admissible path for given recursion, such as an optimistic drift.
+        """Find the best admissible path for a given recursion, such as one with optimistic drifts.
 
         Args:
             recursion: Recursion for expected trust, without leading axes (see `Problem.recursion`).
@@ -316,7 +319,7 @@ class Planner(Summary):
     def evaluate(
         self, path: Sequence[Cell], params: Draws | xr.DataTree, *, x0: ArrayLike | None = None
     ) -> Plan:
-        """Return a plan for a given path; its `exact` is False and its `limit` is NaN.
+        """Return a plan for a given path, with `exact` False and `limit` NaN.
 
         Args:
             path: Cells from start to goal, each adjacent to the previous one.
@@ -327,8 +330,8 @@ class Planner(Summary):
             x0: Expected trust at the start; by default `params.x0_mean`.
 
         Raises:
-            TrustboError: If the robots or features of the parameters differ from the workspace's,
-                or the path has gaps or does not lead from start to goal.
+            TrustboError: If the robots or features of the parameters differ from those of the
+                workspace, or if the path has gaps or does not lead from start to goal.
         """
         path = self.require_path(path)
         return self._evaluated(path, draws_of(params, self.workspace, next_mission=True), None, x0)
@@ -393,7 +396,7 @@ class Planner(Summary):
         - `drift`: drift of the team's mean trust.
         - `trust`: the team's stationary trust, the limit of trust if the bound is repeated.
         - `lost`: contact lost at this trust, in bounds, plus the bound cost.
-        - `cost`: what the bound takes from the objective at this trust; see below.
+        - `cost`: amount by which the bound reduces the objective at this trust; see below.
         - `risk`: -log(1 - p), if the planner has a risk, where p is the failure probability of the
           bound, averaged over the next moves.
 
@@ -402,20 +405,20 @@ class Planner(Summary):
 
         - `lost_contact`: the value is minus the sum. With a risk, the cost of a bound includes
           `failure_cost` times its failure probability, so the value is at least minus the sum.
-        - `terminal`: the value is sigma(c - sum), where c is `graph.graph["constant"]`. Only bounds
-          that enter the goal have another cost than the bound cost.
-        - `mean`: the value of a path of n bounds is c - sum / n. This is no sum, so `cost` orders
-          only paths with the same number of bounds.
+        - `terminal`: the value is sigma(c - sum), where c is `graph.graph["constant"]`. The cost
+          differs from the bound cost only for bounds that enter the goal.
+        - `mean`: the value of a path of n bounds is c - sum / n. Since this value is not a sum,
+          `cost` orders only paths with the same number of bounds.
 
         For the first two objectives, `nx.shortest_path(graph, start, goal, weight="cost")` then has
-        the value of the plan, unless it has more than `max_bounds` bounds, or there is a risk. If
-        beta0 is not 0, it is a heuristic, because trust after a bound depends on the bounds before.
-        `planning.reference` plans in these cases, too, with networkx on the unrolled graph or by
-        enumeration. The costs for your own objectives are those of `terminal` if trust counts at
-        the goal only, and otherwise those of `mean`.
+        the value of the plan, unless it has more than `max_bounds` bounds or the planner has a
+        risk. If beta0 is not 0, this path is a heuristic, because trust after a bound depends on
+        the bounds before it. In these cases, `planning.reference` finds the best path with networkx
+        on the unrolled graph or by enumeration. For your own objectives, the costs are those of
+        `terminal` if trust counts only at the goal, and those of `mean` otherwise.
 
-        Costs are at least 0, as the algorithm of Dijkstra requires, unless a bound cost is
-        negative. Then use `nx.bellman_ford_path`, if no loop has a negative cost.
+        Costs are at least 0, as Dijkstra's algorithm requires, unless a bound cost is negative. In
+        that case, use `nx.bellman_ford_path`, provided that no loop has a negative cost.
 
         Args:
             params: Posterior from `fit`, or parameters. Several draws are replaced by their mean.
@@ -475,11 +478,11 @@ class Planner(Summary):
     ) -> xr.DataArray:
         """Compute how trustworthy a robot is while the lead enters a cell.
 
-        Expected trust is carried over from bound to bound, so it depends on the path. This method
-        returns the stationary trust (I - B0)^-1 u instead, the limit of expected trust if a bound
-        with the drift u is repeated. It depends on the bound only, and equals u if beta0 is 0 or
-        the model has `memory="deviation"`. The trust at a cell is the mean over the bounds that
-        enter it.
+        Expected trust is carried over from bound to bound, so it depends on the path. Instead, this
+        method returns the stationary trust (I - B0)^-1 u, the limit of expected trust if a bound
+        with the drift u is repeated. Stationary trust depends only on the bound, and equals u if
+        beta0 is 0 or if the model has `memory="deviation"`. The trust at a cell is the mean over
+        the bounds that enter it.
 
         Args:
             params: Posterior from `fit`, or parameters of any model.
@@ -488,14 +491,14 @@ class Planner(Summary):
                 `Workspace.locate`); by default all cells.
             move: Direction of the bound that enters the cell, such as `"ne"` (see
                 `workspace.MOVE_NAMES`); by default the mean over all directions.
-            as_rate: Whether to return the expected contact rate at this trust, in [0, 1]. Gaussian
-                contact rates have trust as their mean, which is limited to [0, 1]. With the family
+            as_rate: Whether to return the expected contact rate at this trust, in [0, 1]. The mean
+                of Gaussian contact rates is trust, limited to [0, 1]. For the family
                 `"beta_binomial"`, trust is the logit of the contact rate.
 
         Returns:
-            DataArray with the dims (draw, robot, row, col), without those of a robot or cell that
-            is given, and without draw for a single set of parameters. It is NaN where no bound
-            enters a cell, and, with a warning, for draws in which trust diverges.
+            DataArray with the dims (draw, robot, row, col). The dims of a given robot or cell are
+            dropped, and so is draw for a single set of parameters. Values are NaN where no bound
+            enters a cell and, with a warning, for draws in which trust diverges.
 
         Raises:
             TrustboError: If the robot or move is unknown, the cell is off the grid or impassable,
@@ -512,15 +515,15 @@ class Planner(Summary):
     def robot_maps(self, posterior: Draws | xr.DataTree) -> xr.Dataset:
         """Compute maps of the trust in each robot under a posterior.
 
-        The draws are read in parts, so large maps fit in memory.
+        The draws are processed in parts, so large maps fit in memory.
 
         Args:
             posterior: Posterior from `fit`, or parameters of any model.
 
         Returns:
-            Dataset with the dims (robot, y, x), whose coordinates are those of `maps`, of the mean
-            `trust_mean` and standard deviation `trust_sd` of `trust`, and the mean `contact_rate`
-            of `trust(as_rate=True)`. Cells that no bound enters are NaN.
+            Dataset with the dims (robot, y, x), whose coordinates are those of `maps`. The
+            variables are the mean `trust_mean` and standard deviation `trust_sd` of `trust`, and
+            the mean `contact_rate` of `trust(as_rate=True)`. Cells that no bound enters are NaN.
         """
         draws = robot_draws_of(posterior, self.workspace)
         return robot_maps(self.workspace, self.problem.likelihood, draws)
@@ -531,8 +534,8 @@ class Planner(Summary):
     ) -> xr.DataArray:
         """Compute the largest expected trust on arrival at each cell; NaN if it is unreachable.
 
-        The maximum is over paths to the cell, without U-turns, that have at most two bounds more
-        than the fewest, or fewer if `max_bounds` is tighter. Longer walks are excluded because they
+        The maximum is over paths without U-turns to the cell that have at most two bounds more than
+        the fewest, or fewer if `max_bounds` is tighter. Longer walks are excluded because they
         could gain trust by loitering. With the default `max_bounds` and no bound costs, the value
         at the goal equals the final trust of the `terminal` plan. The map has the shape (row, col),
         or (robot, row, col) with `per_robot`, and a leading axis (draw,) if there are several
@@ -568,10 +571,10 @@ class Planner(Summary):
             `isel(y=row, x=col)` selects a cell. The accessor `.rio` has the CRS and writes rasters.
             The maps are the mean `trust_mean` and standard deviation `trust_sd` of `trust_map`, the
             mean `cost` of `cost_map`, the probability `path_probability` that a cell is on the best
-            path (on the safest path if no path respects `max_failure`), with place effects also
-            their `place_mean` and `place_sd`, and each feature, averaged over robots and moves (as
-            `awareness_<name>` if the name is taken). Impassable cells are NaN. The attribute
-            `start` of maps of trust and cost is the start, whose trust is assumed.
+            path (on the safest path if no path respects `max_failure`), and each feature, averaged
+            over robots and moves (named `awareness_<name>` if the name is taken). With place
+            effects, there are also their `place_mean` and `place_sd`. Impassable cells are NaN. The
+            attribute `start` of the maps of trust and cost is the start, where trust is assumed.
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         trust = trust_map(self.problem, params)

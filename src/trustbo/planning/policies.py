@@ -1,8 +1,8 @@
 """Policies, which choose the next plan based on posterior draws.
 
-A policy is any callable `policy(rng, params, planner) -> Plan`. A callable can be passed wherever
-the name of a policy is accepted. A policy with a parameter `driven` also gets the paths of all
-missions, in order. The policies below report the trust and value of their plan for the posterior
+A policy is any callable `policy(rng, params, planner) -> Plan`. You can pass a callable wherever
+the name of a policy is accepted. A policy with a parameter `driven` also receives the paths of all
+missions, in order. The policies below report the trust and value of their plans at the posterior
 mean of the parameters.
 """
 
@@ -27,7 +27,7 @@ Policy = Callable[..., Plan]
 N_DRAWS = 200
 """Number of draws for which `ucb` and `explore` find the best path."""
 _N_REPEATED = 2
-"""Missions on the same path after which `explore` may leave it."""
+"""Number of missions on the same path after which `explore` may leave it."""
 _N_DRIFTS = 1000  # number of draws whose quantiles `optimistic` computes
 
 
@@ -59,7 +59,8 @@ def optimistic(
 ) -> Plan:
     """Plan the best path for optimistic drifts.
 
-    The drift u of each bound is a high quantile over the draws; other parameters are means.
+    The drift u of each bound is a high quantile over the draws; other parameters are posterior
+    means.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -80,7 +81,7 @@ def optimistic(
 
 
 def ucb(rng: np.random.Generator, params: Draws, planner: Planner, *, kappa: float = 1.0) -> Plan:
-    """Choose, among the draws' best paths, that with the largest mean + `kappa` sd of the value.
+    """Choose the path with the largest mean + `kappa` sd of the value from the draws' best paths.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -102,11 +103,12 @@ def explore(
     regret: float = 0.02,
     doubt: float = 0.1,
 ) -> Plan:
-    """Plan as `greedy`, but as `ucb` if the plan repeats itself although it may not be the best.
+    """Plan like `greedy`, or like `ucb` if the plan repeats itself although it may not be the best.
 
-    A greedy campaign may repeat a path for ever and never learn that another one is better. If the
-    best path under the posterior mean was driven in both of the last two missions, and its relative
-    regret exceeds `regret` with a probability above `doubt`, the path is chosen as in `ucb`.
+    A greedy campaign may repeat a path for ever and never learn that another one is better. The
+    path is therefore chosen as in `ucb` if both of the last two missions took the best path under
+    the posterior mean, and if its relative regret exceeds `regret` with a probability above
+    `doubt`.
 
     Args:
         rng: Random generator.
@@ -136,7 +138,7 @@ def explore(
 
 
 def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
-    """Plan the best path for random drifts, uniform on [0, 1], without using the posterior.
+    """Plan the best path for random drifts, which are uniform on [0, 1]; ignore the posterior.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -180,7 +182,7 @@ def choose_plan(
     planner: Planner,
     driven: Sequence[Sequence[Cell]],
 ) -> Plan:
-    """Call a policy, with the paths of all missions if it has a parameter `driven`."""
+    """Call a policy, and pass it the paths of all missions if it has a parameter `driven`."""
     if "driven" in inspect.signature(policy).parameters:
         return policy(rng, params, planner, driven=driven)
     return policy(rng, params, planner)

@@ -64,10 +64,10 @@ class Problem:
         likelihood: Observation family of the contact rates.
         bound_cost: Additional cost of each bound, shape (move, row, col).
         max_failure: Largest failure probability allowed for a path, or None for no limit.
-        failure_cost: Cost of a failure in bounds; None for the smallest number of bounds of a path.
+        failure_cost: Cost of a failure in bounds, or None for the smallest number of bounds of a
+            path.
         risk: Failure probability of each bound, or None if the planner has no risk.
-        x0: Expected trust at the start, shape (robot,), instead of `x0_mean` of the parameters, or
-            None.
+        x0: Expected trust at the start, shape (robot,), or None for `x0_mean` of the parameters.
     """
 
     paths: AdmissiblePaths
@@ -99,7 +99,7 @@ class Problem:
 
     @property
     def price(self) -> float:
-        """Cost of a failure in bounds; 0 without a risk, or if contact is not the objective."""
+        """Cost of a failure in bounds; 0 without a risk or if contact is not the objective."""
         if self.risk is None or not self.objective.of_contact:
             return 0.0
         if self.failure_cost is None:
@@ -140,9 +140,9 @@ class Problem:
             lost: Contact lost in each bound plus the bound cost, shape (bound,).
 
         Returns:
-            Costs (bound,), which are not negative unless a bound cost is, and a constant c. The
-            score of a path is c - (sum of costs), or c - (sum of costs) / n if it is the mean over
-            n bounds.
+            Costs (bound,), which are nonnegative unless a bound cost is negative, and a constant c.
+            The score of a path is c - (sum of costs), or c - (sum of costs) / n if it is a mean
+            over n bounds.
         """
         bounds = self.paths.bounds
         if self.objective.of_contact:
@@ -157,7 +157,7 @@ class Problem:
             constant = float(np.max(-cost, initial=0.0))
             return cost + constant, constant
 
-        # Trust counts at the goal only. The constant makes the costs of the last bounds positive.
+        # Trust counts only at the goal. The constant makes the costs of the last bounds positive.
         enters_goal = np.zeros(bounds.shape, bool)
         enters_goal[:, *self.paths.goal] = True
         is_last = enters_goal[bounds]
@@ -193,7 +193,8 @@ class Problem:
 
     @cached_property
     def risks(self) -> "Risks | None":
-        """Risks of the bounds, as the search needs them; None if plans do not depend on risk.
+        """Risks of the bounds in the form that the search uses; None if plans do not depend on
+        risk.
 
         Raises:
             TrustboError: If `max_failure` is set without a risk, or `p_fail` of a bound is NaN.
@@ -222,7 +223,7 @@ class Problem:
 
     @property
     def _components(self) -> Components:
-        """Components of the risk; without any, one that has the mean failure probabilities."""
+        """Components of the risk, or a single one with the mean failure probabilities."""
         risk = cast("Risk", self.risk)
         return risk.components or Components(risk.p_fail[None], np.ones(1))
 
@@ -253,7 +254,7 @@ class Problem:
             return score, score, paths
 
         n_trust = 0
-        loss = LOGISTIC  # not used, because no trust is followed
+        loss = LOGISTIC  # not used, because trust is not tracked
         if history:  # the cost depends on trust itself and is not a weighted sum of drifts
             n_trust = n_states
             loss = LOSSES[self.likelihood.expected_rate]
@@ -280,7 +281,7 @@ class Problem:
         return -cost, -lower, paths
 
     def safest(self) -> tuple[tuple[Cell, ...], float]:
-        """Find the admissible path with the smallest failure probability; it needs a risk.
+        """Find the admissible path with the smallest failure probability; requires a risk.
 
         Returns:
             The path, and its failure probability, which accounts for the components of the risk.
@@ -323,7 +324,7 @@ class Problem:
             )
 
     def _raise_infeasible(self) -> NoReturn:
-        """Raise an error that says that no path respects `max_failure`, with the safest path."""
+        """Raise an error with the safest path, because no path respects `max_failure`."""
         path, p_fail = self.safest()
         if p_fail <= cast("float", self.max_failure):
             raise TrustboError(
@@ -344,10 +345,9 @@ class Risks(NamedTuple):
     """Risks -log(1 - p_fail) of the bounds, which the search sums along a path.
 
     `of_edges` (edge, component) contains the risks of the bounds that each edge of `paths.paired`
-    completes, with one column per component of the risk. A path whose risks add
-    up to r_m in column m fails with the probability sum_m w_m (1 - exp(-r_m)), where `weights`
-    (component,) contains the w_m. This probability must not exceed `limit`, and a failure costs
-    `price`.
+    completes, with one column per component of the risk. If the risks of a path add up to r_m in
+    column m, it fails with probability sum_m w_m (1 - exp(-r_m)), where `weights` (component,)
+    contains the w_m. This probability must not exceed `limit`, and a failure costs `price`.
     """
 
     of_edges: np.ndarray
@@ -394,14 +394,14 @@ def _require_draws(given: object) -> Draws:
 
 
 def robot_draws_of(posterior: Draws | xr.DataTree, workspace: Workspace) -> Draws:
-    """Return `draws_of`, but with the effects of robots in bounds, which plans leave out."""
+    """Return the same as `draws_of`, but with the effects of robots in bounds, which plans omit."""
     if isinstance(posterior, xr.DataTree):
         return with_robots_in_bounds(*expected_and_drawn(posterior, workspace))
     return _require_draws(posterior)
 
 
 def with_robots_in_bounds(expected: Draws, drawn: Draws) -> Draws:
-    """Return draws with expected effects of missions, and with the effects in bounds of `drawn`."""
+    """Return draws with the expected effects of missions and the effects in bounds of `drawn`."""
     own = drawn.place_robot if isinstance(drawn, ParameterDraws) else None
     if own is None:
         return expected
@@ -419,8 +419,8 @@ def mean_and_draws_of(
 ) -> tuple[Draws, Draws | None]:
     """Return `mean_of` and the draws for bands, or None if there is only a single draw.
 
-    The draws are those of `params_of(next_mission=True)`. A posterior is read once, which
-    draws its maps of place effects once.
+    The draws are those of `params_of(next_mission=True)`. A posterior is read only once, so its
+    maps of place effects are drawn only once.
     """
     if isinstance(params, xr.DataTree):
         expected, drawn = expected_and_drawn(params, workspace)

@@ -18,11 +18,11 @@ class Recursion(NamedTuple):
     """Recursion x_k = transition x_{k-1} + drift(bound) for expected trust, with x_0 = start.
 
     The shapes are transition (..., state, state), drift (..., state, move, row, col) for a map or
-    (..., state, bound) for a path, start (..., state) and noise_sd (...,), where noise_sd is the
-    mean over robots of the standard deviation of a rate given trust, including noise that robots
-    share. Each robot is a state, and the team's trust is the mean of the states. If all robots have
-    the same beta0, the mean trust is the only state. The drift at (move, row, col) belongs to the
-    bound that enters the cell by that move; the drift is NaN if there is no such bound.
+    (..., state, bound) for a path, start (..., state) and noise_sd (...,). noise_sd is the mean
+    over robots of the standard deviation of a rate given trust, including noise that robots share.
+    Each robot is a state, and the team's trust is the mean of the states. If all robots have the
+    same beta0, the mean trust is the only state. The drift at (move, row, col) belongs to the bound
+    that enters the cell by that move; the drift is NaN if there is no such bound.
     """
 
     transition: np.ndarray
@@ -88,8 +88,8 @@ def trust_recursion(
         """Give values (draw, ...) the leading axes of the parameters."""
         return values.reshape((*leading, *values.shape[1:]))
 
-    # Expected trust is x_k = A (x_{k-1} - o_{k-1}) + u_k + o_k. Inputs either all are a drift u, or
-    # all are an offset o, in which case the expected state d = x - o stays 0.
+    # Expected trust is x_k = A (x_{k-1} - o_{k-1}) + u_k + o_k. Either all inputs are drifts u, or
+    # all inputs are offsets o. In the second case, the expected state d = x - o stays 0.
     transition = of_draws(space.over_robots(n_robots))
     if not draws.carried:
         transition = np.zeros_like(transition)
@@ -135,14 +135,14 @@ def expected_trust(
         awareness: Situational awareness along the path, shape (bound, robot, feature).
         x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default
             `params.x0_mean`.
-        path: Cells of the path, start first; needed with place effects.
+        path: Cells of the path, beginning with the start; needed with place effects.
 
     Returns:
         Expected trust after each bound, shape (..., bound, robot).
 
     Raises:
-        TrustboError: If the number of robots or features does not match the parameters, the path
-            has another length, or there are place effects and no path is given.
+        TrustboError: If the number of robots or features does not match the parameters; the path
+            has the wrong length; or there are place effects but no path is given.
 
     Example:
         >>> awareness = workspace.along(path)

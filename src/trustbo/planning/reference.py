@@ -1,10 +1,10 @@
 """Reference planner, based on networkx and enumeration, for testing the compiled searches.
 
-It covers everything that `Planner.plan` does: all objectives, families, models, costs, risks and
-limits. If the score of a path is a sum over its bounds, the Bellman-Ford algorithm of networkx
-finds the best path in the unrolled graph, whose nodes consist of a cell and the number of bounds
-left. If the score is a nonlinear function of trust, or depends on a risk, all admissible paths are
-enumerated, which is feasible for small grids. Neither method uses the compiled kernels.
+The reference planner covers everything that `Planner.plan` does: all objectives, families, models,
+costs, risks and limits. If the score of a path is a sum over its bounds, the Bellman-Ford algorithm
+of networkx finds the best path in the unrolled graph, whose nodes consist of a cell and the number
+of bounds left. If the score is a nonlinear function of trust, or depends on a risk, all admissible
+paths are enumerated, which is feasible for small grids. Neither method uses the compiled kernels.
 """
 
 import time
@@ -38,7 +38,7 @@ def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None 
     optimal.
 
     Args:
-        planner: Planner; for a small grid if all paths have to be enumerated.
+        planner: Planner; its grid must be small if all paths have to be enumerated.
         params: Posterior from `fit`, or parameters; see `Planner.plan`.
         x0: Expected trust at the start; by default `params.x0_mean`.
 
@@ -81,8 +81,8 @@ def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None 
 def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cell, ...]]:
     """Find the best path for each number of bounds with `networkx.bellman_ford_path`.
 
-    A bound with drift u and j bounds left after it adds w_j . u minus its cost to the value. Here,
-    w_j = sum_{i <= j} credit(i) s . B0^(j - i), where s . x is the team's mean trust.
+    A bound with drift u that is followed by j more bounds adds w_j . u minus its cost to the value.
+    Here, w_j = sum_{i <= j} credit(i) s . B0^(j - i), where s . x is the team's mean trust.
     """
     problem = planner.problem
     graph = problem.paths.graph
@@ -138,7 +138,7 @@ def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Cell]) -> f
 
 
 def _infeasible(problem: Problem, risk: Risk) -> InfeasibleError:
-    """Return an error that says that no path respects `max_failure`, with the safest path."""
+    """Return an error with the safest path, because no path respects `max_failure`."""
     safest = min(every_path(problem.paths), key=risk.failure)
     p_fail = risk.failure(safest)
     return InfeasibleError(

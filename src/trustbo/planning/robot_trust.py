@@ -1,9 +1,9 @@
 """Stationary trust in each robot at each cell, from posterior draws of any model.
 
 If a bound were repeated without end, expected trust x_k = B0 x_{k-1} + u would converge to the
-stationary trust (I - B0)^-1 u. It is the trust that the place itself justifies: trust when the path
-arrives has faded out of it. The stationary trust of a robot at a cell is the mean over the bounds
-that enter the cell.
+stationary trust (I - B0)^-1 u. This is the trust that the place itself justifies: the trust with
+which the path arrives no longer has any influence. The stationary trust of a robot at a cell is the
+mean over the bounds that enter the cell.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVE_NAMES
 
 _NUMBERS = 2_000_000
-"""Most values (draw, robot, bound) that are computed at once."""
+"""Largest number of values (draw, robot, bound) that are computed at once."""
 
 
 class Bounds(NamedTuple):
@@ -109,7 +109,8 @@ def robot_maps(workspace: Workspace, family: Family, draws: Draws) -> xr.Dataset
     rates = np.zeros(shape)
     diverging = []
 
-    # Sums of deviations from the first draw keep one map per robot in memory, and do not cancel.
+    # Sums of deviations from the first draw need one map per robot in memory, and avoid
+    # cancellation.
     for part, of_bounds in _stationary(bounds, draws):
         trust = bounds.mean(of_bounds)
         rate = bounds.mean(_rate_of(of_bounds, family, part))
@@ -125,7 +126,7 @@ def robot_maps(workspace: Workspace, family: Family, draws: Draws) -> xr.Dataset
             rates += rate[~is_diverging].sum(0)
 
     is_diverging = np.concatenate(diverging)
-    _warn_of_draws(is_diverging)  # raises an error if no draw is left
+    _warn_of_draws(is_diverging)  # raises an error if no draws are left
     n = (~is_diverging).sum()
     shift = total / n
     maps = {
@@ -144,7 +145,7 @@ def robot_maps(workspace: Workspace, family: Family, draws: Draws) -> xr.Dataset
 
 
 def _bounds_of(workspace: Workspace, cell: Location | None, move: str | None) -> Bounds:
-    """Find the bounds that enter a cell, or any cell, by a move, or by any move.
+    """Find the bounds that enter a cell (or any cell) by a move (or by any move).
 
     Raises:
         TrustboError: If the move is unknown, the cell is off the grid or impassable, or no such
@@ -180,7 +181,7 @@ def _bounds_of(workspace: Workspace, cell: Location | None, move: str | None) ->
 
 
 def _stationary(bounds: Bounds, draws: Draws) -> Iterator[tuple[Draws, np.ndarray]]:
-    """Yield some draws at a time, and the stationary trust (draw, robot, bound) under these draws.
+    """Yield chunks of draws with the stationary trust (draw, robot, bound) under these draws.
 
     Trust is NaN for draws in which it diverges.
     """
@@ -212,7 +213,7 @@ def _rate_of(trust: np.ndarray, family: Family, draws: Draws) -> np.ndarray:
 
 
 def _warn_of_draws(diverging: np.ndarray) -> None:
-    """Warn of draws without stationary trust; raises TrustboError if there are no others."""
+    """Warn about draws without stationary trust; raise TrustboError if there are no others."""
     n = int(diverging.sum())
     if not n:
         return

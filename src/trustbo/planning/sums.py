@@ -1,8 +1,8 @@
 """Dynamic programming on the unrolled graph, for objectives that are sums over the bounds.
 
-If a bound has drift u and is followed by j more bounds, it adds w_j . u to the value, however
-long the path is. The weights w_j are computed by `objectives.weights_of`. States are processed in
-order of the number of bounds left, so that the successors of a state are final (Bellman 1958).
+A bound with drift u that is followed by j more bounds adds w_j . u to the value, regardless of the
+length of the path. `objectives.weights_of` computes the weights w_j. States are processed in order
+of the number of bounds left, so the successors of a state are final (Bellman 1958).
 """
 
 import numpy as np

@@ -33,7 +33,7 @@ def trust_map(
         trust = like.expand_dims(draw=len(values)).copy(data=values)
     else:
         trust = like.copy(data=values[0])
-    start = path_text([problem.paths.start])  # where trust is assumed, see `plots`
+    start = path_text([problem.paths.start])  # cell in which trust is assumed; see `plots`
     return trust.rename("trust").assign_attrs(long_name="expected trust", start=start)
 
 
@@ -49,14 +49,14 @@ def _largest(paths: AdmissiblePaths, recursion: Recursion, state_weights: np.nda
 
     weights = state_weights @ recursion.transition  # (draw, state)
     beta0 = np.divide(weights, state_weights, out=np.zeros_like(weights), where=state_weights > 0.0)
-    # Whether the scalar state_weights . x has a recursion of its own.
+    # Check whether the scalar state_weights . x has its own recursion.
     scalar = (weights == beta0.max(-1, keepdims=True) * state_weights).all()
     if scalar and (beta0 >= 0.0).all():
         drift = np.einsum("s,dsmrc->dmrc", state_weights, recursion.drift)
         drift = np.where(paths.bounds, drift, np.nan)
         return best_trust(paths, extra, drift, beta0.max(-1), recursion.start @ state_weights)
 
-    # Otherwise, one search for each cell.
+    # Otherwise, search once for each cell.
     drift = recursion.drift.reshape(*recursion.start.shape, -1)
     values = np.full((len(drift), *paths.bounds.shape[1:]), np.nan)
     no_cost = np.zeros(paths.bounds.size)
@@ -88,7 +88,7 @@ def best_trust(
         Largest trust, shape (draw, row, col).
     """
     fewest = paths.bounds_from_start
-    margin = ((0, 0), (0, 0), (1, 1), (1, 1))  # of one cell, so that no index is out of range
+    margin = ((0, 0), (0, 0), (1, 1), (1, 1))  # one cell wide, so that no index is out of range
     u = np.pad(np.where(np.isnan(drift), -np.inf, drift), margin, constant_values=-np.inf)
     n_draws, n_moves, rows, cols = u.shape
     reach = np.pad(np.where(fewest < 0, -1, fewest + extra), 1, constant_values=-1)

@@ -20,12 +20,12 @@ kernel = kernels.kernel()
 
 
 class Unrolled(NamedTuple):
-    """Graph whose states are sorted by the bounds left, and whose edges are sorted by their tails.
+    """Graph whose states are sorted by the number of bounds left, and edges by their tails.
 
     Attributes:
         cell: Flat index of the cell of each state, shape (state,).
         n_bounds_left: Number of bounds left in each state, shape (state,); state 0 is the goal.
-        first: Index of the first edge that leaves each state, then the number of edges.
+        first: Index of the first edge that leaves each state, followed by the number of edges.
         head: State to which each edge leads, shape (edge,).
         bound: Flat index move * cells + cell of the bound of each edge, shape (edge,).
         starts: Index of the start state of each path length, ascending, shape (length,).
@@ -82,14 +82,15 @@ class Unrolled(NamedTuple):
 class Paired(NamedTuple):
     """Unrolled graph for costs that depend on a bound and on the next move.
 
-    A state of `graph` is a state of the plain graph together with the bound that led there, so that
-    each edge knows the bound before it. U-turns are excluded by leaving out their edges.
+    A state of `graph` is a state of the plain graph together with the bound that led to it, so each
+    edge knows the bound before it. U-turns are excluded by leaving out their edges.
 
     Attributes:
         graph: Unrolled graph; its attribute `turns` is True, as no search has to exclude U-turns.
         completed: Flat index into (move, row, col, next_move) of the bound before each edge, with
             the move of the edge as the next move, shape (edge,); -1 if the edge leaves the start.
-        last: The same index of the edge's own bound if it enters the goal, shape (edge,), else -1.
+        last: The same index for the edge's own bound if it enters the goal, otherwise -1, shape
+            (edge,).
     """
 
     graph: Unrolled
@@ -104,7 +105,7 @@ class Paired(NamedTuple):
                 col, next_move).
 
         Returns:
-            Sums (edge, ...). The sum along a path contains each bound of the path once.
+            Sums (edge, ...). The total along a path counts each bound of the path once.
         """
         nothing = np.zeros((1, *values.shape[1:]))
         padded = np.concatenate([values, nothing])  # the index -1
@@ -119,10 +120,11 @@ def paired(graph: Unrolled, n_cells: int) -> Paired:
         n_cells: Number of cells of the grid.
     """
     n_moves = END
-    move = graph.bound // n_cells  # of each edge
+    move = graph.bound // n_cells  # move of each edge
 
-    # A state has the key `number of the plain state` x 9 + `move that led there`, where 8 stands
-    # for the start, so that the order of the states is kept. All ways to enter the goal are one.
+    # The key of a state is `number of the plain state` x 9 + `move that led there`, where 8 stands
+    # for the start. These keys keep the order of the states. All ways to enter the goal form one
+    # state.
     width = n_moves + 1
     onward = np.where(graph.head > 0, graph.head.astype(np.int64) * width + move, 0)
     begun = graph.starts.astype(np.int64) * width + n_moves
