@@ -12,9 +12,9 @@ trust. Because B0 >= 0 preserves the order of trust, any path to the goal is at 
 the other label. If U-turns are forbidden, the other label must come from the same cell, or there
 must be two such labels from different cells. A label is also dropped if no path that continues it
 can be better than the best path found so far. To check this, the remaining cost is bounded from
-below by a sum over edges. The sum uses the largest possible trust, and the chord of F_m (1 -
-exp(-r_m)) over the sums that can still be optimal. For the limit, w_m (1 - exp(-r_m)) is also
-replaced by its chord. The limit is then relaxed with a Lagrange multiplier, which is found by
+below by a sum over edges. The sum uses the largest possible trust, and the chord of
+F_m (1 - exp(-r_m)) over the sums that can still be optimal. For the limit, w_m (1 - exp(-r_m)) is
+also replaced by its chord. The limit is then relaxed with a Lagrange multiplier, which is found by
 bisection (Handler and Zang 1980).
 
 The search is exact because no dropped label can lead to a better path than the one returned.

@@ -193,8 +193,7 @@ class Problem:
 
     @cached_property
     def risks(self) -> "Risks | None":
-        """Risks of the bounds in the form that the search uses; None if plans do not depend on
-        risk.
+        """Risks of the bounds in the form of the search; None if plans do not depend on risk.
 
         Raises:
             TrustboError: If `max_failure` is set without a risk, or `p_fail` of a bound is NaN.
