@@ -102,7 +102,7 @@ def fit_hazard(
         cell = tuple(cells[outside][0].tolist())
         raise TrustboError(f"a mission enters {cell}, outside the workspace of shape {shape}.")
 
-    # A bound that was driven but does not exist on the map has the largest difficulty.
+    # A bound that the robots drove, but that does not exist on the map, has the largest difficulty.
     units = trials.of_units(difficulty.unit)
     met = np.nan_to_num(measures.values[*units.bounds.T], nan=1.0)
     names = measures["measure"].values.tolist()

@@ -373,8 +373,8 @@ class PathRisk(NamedTuple):
     p_fail: np.ndarray
     """Posterior mean probability that each bound, once begun, ends the mission, shape (bound,)."""
     p_arrive: float
-    """Probability of reaching the goal. With draws, it is the mean over draws of the product of 1 -
-    p_fail, because failures are correlated; without draws, it is the product of the means."""
+    """Probability of reaching the goal. With draws, it is the mean over draws of the product of
+    1 - p_fail, because failures are correlated; without draws, it is the product of the means."""
     p_arrive_band: tuple[float, float]
     """Ends of the 90 % band of `p_arrive` over the draws; NaN without draws."""
 

@@ -33,7 +33,7 @@ from trustbo.streams import stream
 _NUMBERS = 2_000_000
 """Largest number of log-likelihoods that are returned; beyond it, fewer draws are returned."""
 _FEWEST_DRAWS = 200
-"""Smallest number of draws that are returned, whatever the number of rates."""
+"""Smallest number of draws that are returned, regardless of the number of rates."""
 _OF_RATES = ("mission", "bound", "robot")
 _PER_DRAW = ("posterior", "sample_stats", "log_prior")
 """Groups from which the chosen draws are copied."""

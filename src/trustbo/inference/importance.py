@@ -37,7 +37,7 @@ DEGREES = 8.0
 _PRIOR_SCALE = 1.2
 """Scale of the usual defensive proposal; the prior has scale 1."""
 _WIDER = 1.1
-"""Scale of a proposal relative to the points that it is fitted to."""
+"""Scale of a proposal relative to the points to which it is fitted."""
 _KERNELS = 16
 """Number of kernels."""
 _KERNEL_SCALE = 0.7

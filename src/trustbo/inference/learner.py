@@ -1,7 +1,7 @@
 """Models as campaigns use them: fitting to missions, and draws for planning.
 
-A model is a `TrustModel` or a NumPyro function. Both become a `Learner`, so that only this module
-distinguishes them.
+A model is a `TrustModel` or a NumPyro function. Both are converted to a `Learner`, so only this
+module distinguishes them.
 """
 
 import json

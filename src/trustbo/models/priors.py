@@ -149,8 +149,8 @@ class Priors(Summary):
     def for_cells(cls, family: str = "gaussian") -> "Priors":
         """Return priors for awareness of cells without line of sight, on the scale of contact.
 
-        No feature predicts the contact rate, so stationary trust is 0.5 in expectation, whatever
-        the awareness. Divided by 1 - beta0, the weights have the prior N(0, 0.25^2), which allows
+        No feature predicts the contact rate, so the prior mean of stationary trust is 0.5 for any
+        awareness. Divided by 1 - beta0, the weights have the prior N(0, 0.25^2), which allows
         either sign, and the intercept has N(0.5, 0.15^2). These are the standard deviations that
         `from_features` uses for features other than line of sight. For tick counts, the priors are
         scaled by 5, and a trust of 0 corresponds to a rate of 0.5.

@@ -145,7 +145,7 @@ class AdmissiblePaths:
 
     @cached_property
     def graph(self) -> Unrolled:
-        """Unrolled graph of the paths; raises TrustboError if it is too large."""
+        """Unrolled graph of the paths; a graph that is too large raises TrustboError."""
         n_moves, rows, cols = self.bounds.shape
         bounds = self.bounds.reshape(n_moves, -1)
         far = self.bounds_to_goal.ravel()

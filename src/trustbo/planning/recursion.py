@@ -19,11 +19,11 @@ class Recursion(NamedTuple):
 
     The shapes are transition (..., state, state), drift (..., state, move, row, col) for a map or
     (..., state, bound) for a path, start (..., state) and noise_sd (...,). Here, noise_sd is the
-    mean over robots of the standard deviation of a rate given trust, including the noise that robots
-    share.
-    Each robot is a state, and the team's trust is the mean of the states. If all robots have the
-    same beta0, the mean trust is the only state. The drift at (move, row, col) belongs to the bound
-    that enters the cell by that move; the drift is NaN if there is no such bound.
+    mean over robots of the standard deviation of a rate given trust, including the noise that
+    robots share. Each robot is a state, and the team's trust is the mean of the states. If all
+    robots have the same beta0, the mean trust is the only state. The drift at (move, row, col)
+    belongs to the bound that enters the cell by that move; the drift is NaN if there is no such
+    bound.
     """
 
     transition: np.ndarray

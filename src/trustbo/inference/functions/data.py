@@ -16,7 +16,7 @@ NAMES = ("awareness", RATES, "n_ticks", "duration", "cell", "bound", "features",
 _NOT_ARRAYS = ("features", "observations")
 """Inputs that compiled functions cannot take as arguments."""
 _STEP_OF_BOUNDS = 8
-"""Bounds are padded to a multiple of this number, so that few shapes are compiled."""
+"""Bounds are padded to a multiple of this number, which limits the number of compiled shapes."""
 _FEWEST_MISSIONS = 4
 """Missions are padded to a power of 2 that is at least this number."""
 _UNKNOWN = -1

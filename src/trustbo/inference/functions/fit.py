@@ -574,7 +574,7 @@ def _start(
     chains: int,
     seed: int,
 ) -> Start:
-    """Return where the chains start: at draws of a previous posterior of the same function."""
+    """Return the starts of the chains, which are draws of a previous posterior of the function."""
     with own_settings():
         free = free_shapes(model, sites, data)
     n = sum(values.size for values in free.values())

@@ -439,7 +439,7 @@ class FunctionModel:
 
 
 class _explained:  # noqa: N801
-    """Context in which an error in a user's function says which function failed."""
+    """Context in which the message of an error in a user's function names the function."""
 
     def __init__(self, model: FunctionModel, data: Data) -> None:
         self.model = model

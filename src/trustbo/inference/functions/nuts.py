@@ -40,7 +40,7 @@ _FIELDS = ("num_steps", "diverging", "accept_prob", "energy", "potential_energy"
 
 
 class Start(NamedTuple):
-    """Where the chains start."""
+    """Starts of the chains."""
 
     x: np.ndarray
     """Candidates, shape (chain, candidate, coordinate)."""

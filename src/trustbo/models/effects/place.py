@@ -38,9 +38,9 @@ class PlaceEffect(Effect):
     covariance tau_r^2 (I - 1/n).
 
     The errors of awareness differ between robots, and they are the same each time that the robots
-    drive a bound. Without r_i, these errors would look like independent noise, and bounds that are
-    driven repeatedly would seem to be strong evidence for wrong weights. Plans leave out r_i, whose
-    mean over the team is 0; forecasts and the trust in single robots include r_i.
+    drive a bound. Without r_i, these errors would look like independent noise, and bounds that the
+    robots drive repeatedly would seem to be strong evidence for wrong weights. Plans leave out r_i,
+    whose mean over the team is 0; forecasts and the trust in single robots include r_i.
 
     Missions on another map (see `Mission.map`) have other places. The effects of these places are
     independent of those of the workspace, but have the same standard deviations and length scale.
