@@ -4,14 +4,15 @@ Hyperparameters are sampled as *scores* z, which are standard normal a priori. A
 (coefficients, effects, trust) are integrated out of the density and drawn given the scores.
 
 1. `climb` searches for a mode from each start, and `fit_mode` fits a skewed Student-t at the mode
-   by finite differences. 2. Each round draws points from the current proposal, from the fits at the
-   modes if there are several modes, and from a defensive proposal, which covers regions that other
-   proposals miss. All proposals so far form a mixture q, and every point has the weight p(z) /
-   q(z). 3. A skewed Student-t is fitted to the weighted points for the next round. As long as few
-   points are effective, the fit stays near the first proposal. If k-hat is bad after the second
-   round, half of the points of all later rounds are drawn from kernels (West 1993), because kernels
-   can also describe curved densities. The kernels are centred at points drawn by weight. Sampling
-   stops when k-hat and the effective number of points are good.
+   by finite differences.
+2. Each round draws points from the current proposal, from the fits at the modes if there are
+   several modes, and from a defensive proposal, which covers regions that other proposals miss. All
+   proposals so far form a mixture q, and every point has the weight p(z) / q(z).
+3. A skewed Student-t is fitted to the weighted points for the next round. As long as few points are
+   effective, the fit stays near the first proposal. If k-hat is bad after the second round, half of
+   the points of all later rounds are drawn from kernels (West 1993), because kernels can also
+   describe curved densities. The kernels are centred at points drawn by weight. Sampling stops when
+   k-hat and the effective number of points are good.
 
 The weights are Pareto-smoothed (Vehtari, Simpson, Gelman, Yao and Gabry 2024). The mean weight
 before smoothing is an estimate of the evidence.
