@@ -90,13 +90,16 @@ def check(
 ) -> Check:
     """Check a fitted model of contact rates for possible problems.
 
-    A robot stands out in a mission if its effect differs from the team's median by more than .1 of
-    line of sight, with a probability above .95. With two robots, the median lies halfway between
-    them, so the difference between the robots is tested instead. A place stands out if its effect
-    differs from the median over the visited places by more than .1 of contact. The median is
-    subtracted because a shift that most places share cannot be distinguished from the intercept. A
-    weight stands out if its sign contradicts its prior. The coverage of 90 % intervals one mission
-    ahead stands out if it differs from .9 by more than .05 and two standard errors over missions.
+    A robot stands out in a mission if its effect differs from the median over all robots and
+    missions by more than .1 of line of sight, with a probability above .95. With two robots, the
+    median lies halfway between them, so the difference between the robots is tested instead.
+
+    A place stands out if its effect differs from the median over the visited places by more than .1
+    of contact, with a probability above .95. The median is subtracted because a shift that most
+    places share cannot be distinguished from the intercept. A weight stands out if its sign
+    contradicts its prior. The coverage of 90 % intervals one mission ahead stands out if it differs
+    from .9 by more than .05 and two standard errors over missions.
+
     See also `pit` of `tb.inference.score` for the shape of predictions, `tb.compare` for other
     models, and `az.psense_summary(posterior)` for the sensitivity to the priors.
 

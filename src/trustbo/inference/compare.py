@@ -36,9 +36,10 @@ def compare(
 
     With few missions, LOO often cannot tell which model is better. The column `verdict` is
     `"undecided"`, followed by the reason, if the difference from the best model is below 4 nats or
-    below two standard errors, or if there are fewer than 10 missions. If a verdict is undecided, do
-    not use the weights or the order of the models. `p`, the effective number of parameters, should
-    be much smaller than `n_missions`.
+    below two standard errors, or if there are fewer than 10 missions. The best model is also
+    `"undecided"`, without a reason, if another model is. If a verdict is undecided, do not use the
+    weights or the order of the models. `p`, the effective number of parameters, should be much
+    smaller than `n_missions`.
 
     Args:
         posteriors: Two or more posteriors by name, fitted to the same missions. Each is from `fit`,

@@ -116,7 +116,7 @@ class Density:
 
     @property
     def _n_at_once(self) -> int:
-        """Number of points evaluated at once, so that their matrices stay in memory in use."""
+        """Number of points evaluated at once, which limits the memory for their matrices."""
         return int(np.clip(_NUMBERS // self.blocks.order.size, 1, _CHUNK))
 
     def _order(self) -> Order:

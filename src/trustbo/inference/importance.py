@@ -9,7 +9,7 @@ Hyperparameters are sampled as *scores* z, which are standard normal a priori. A
    several modes, and from a defensive proposal, which covers regions that other proposals miss. All
    proposals so far form a mixture q, and every point has the weight p(z) / q(z).
 3. A skewed Student-t is fitted to the weighted points for the next round. As long as few points are
-   effective, the fit stays near the first proposal. If k-hat is bad after the second round, half of
+   effective, the fit stays near the first proposal. If k-hat is bad after round 2 or later, half of
    the points of all later rounds are drawn from kernels (West 1993), because kernels can also
    describe curved densities. The kernels are centred at points drawn by weight. Sampling stops when
    k-hat and the effective number of points are good.

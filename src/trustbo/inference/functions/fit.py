@@ -509,11 +509,11 @@ def _sampled(
 ) -> tuple[Samples, Verdict]:
     """Run NUTS until the diagnostics are good or many draws have been taken.
 
-    Each run starts from draws of the run before. The draws of runs without divergent transitions
-    are joined. The requested number of draws is kept, evenly spaced, or all draws if the checks
-    need more. After a divergence, earlier draws are discarded, and steps are smaller. From the
-    second run on, a few divergences and variables that are not identified are accepted; see
-    `_judge`.
+    Each run starts from draws of the run before, and the draws of all runs are joined. The
+    requested number of draws is kept, evenly spaced, or all draws if the checks need more. If a
+    transition of the first run or more than 0.5 % of those of a later run diverge, all draws so far
+    are discarded, and steps are smaller. From the second run on, a few divergences and variables
+    that are not identified are accepted; see `_judge`.
 
     Returns:
         Samples, and the verdict on them.
