@@ -22,9 +22,10 @@ Data:
   is declared instead of being left to the solver.
 - While T2 closes up, contact is that of the lead's lidar, and counts in the rates of the robots.
 - The lead stops near the centre of the next cell, where the surrounding routes are seen best.
-- Campaigns learn from all missions at once. In the paper, the posterior is the prior of the next
-  iteration, and the posterior on a given terrain is the prior on the mission terrain. To do the
-  latter, pass the result on the given terrain as `earlier=`.
+- Campaigns learn from all missions at once. In the paper, the posterior of one iteration is the
+  prior of the next one. The paper also learns on a given terrain first, and starts on the mission
+  terrain with the resulting posterior. To do this, pass the result on the given terrain as
+  `earlier=`.
 
 Planning:
 

@@ -52,8 +52,8 @@ class Trials(NamedTuple):
         """Count the trials in measured missions and in lost missions.
 
         The last bound of a failed mission counts as a failure, and so does each earlier bound that
-        failed. An aborted bound is not counted. A bound back from a bound that was not completed is
-        not counted either, unless it fails, because the robots drove only a part of it.
+        failed. An aborted bound is not counted. If the robots turn back during a bound, they drive
+        only a part of the bound that leads back, so this bound is counted only if it fails.
 
         Raises:
             TrustboError: If a path skips cells or does not enter `where`.

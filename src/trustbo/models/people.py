@@ -131,7 +131,7 @@ class HumanTrust(PooledTrust):
     def random_effects(self, theta: Theta, observations: Observations) -> Inputs:
         """See `TrustModel.random_effects`.
 
-        The effects are the personal start, level, gain from success and gain from failure.
+        Each person has four effects: a start, a level, a gain from success and a gain from failure.
         """
         shape = *observations.contact_rate.shape, 4
         carried = np.zeros(shape)
