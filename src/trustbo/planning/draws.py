@@ -62,8 +62,8 @@ class DrawnPaths:
 
         For lost_contact, the regret is divided by the contact that is kept on the best path: the
         number of bounds of this path minus the lost contact and the failure cost. For other
-        objectives, the regret is divided by the absolute value of the best path. If the divisor is 0, a
-        positive regret becomes infinite.
+        objectives, the regret is divided by the absolute value of the best path. If the divisor is
+        0, a positive regret becomes infinite.
         """
         scale = np.abs(self.values)
         if self.problem.objective.of_contact:
