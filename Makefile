@@ -22,9 +22,8 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: $(VENV)/.installed
 	$(BIN)/python scripts/demo.py --out out/demo
 
-# A fresh clone compiles for long what these tests run for short: with no optimisation, half as long.
 test: $(VENV)/.installed-dev
-	XLA_FLAGS=--xla_backend_optimization_level=0 $(PYTEST) -m "not slow" tests
+	$(PYTEST) -m "not slow" tests
 
 jupyter: $(VENV)/.installed-notebook
 	$(BIN)/jupyter lab notebooks
