@@ -120,9 +120,9 @@ def by_group(rows: pd.DataFrame) -> pd.DataFrame:
         names = some.index.get_level_values("world")
         numbers = {name: some[name].to_numpy() for name in methods}
         best = some[methods[1:]].mean().idxmin() if len(methods) > 1 else None
-        numbers |= {f"{OURS} less {name}": numbers[OURS] - numbers[name] for name in methods[1:]}
+        numbers |= {f"{OURS} minus {name}": numbers[OURS] - numbers[name] for name in methods[1:]}
         if best is not None:
-            numbers[f"{OURS} less the best ({best})"] = numbers[OURS] - numbers[best]
+            numbers[f"{OURS} minus the best ({best})"] = numbers[OURS] - numbers[best]
         grounds = grounds_of(names)
         found = bootstrap(numbers, grounds, np.mean)
         for name in numbers:
@@ -237,11 +237,13 @@ def report_groups(rows: pd.DataFrame) -> None:
 
 
 def interval(row: object, places: int) -> str:
-    """Format a value with its interval."""
+    """Format a value with its interval, or with "-" if worlds on one terrain give none."""
     value, low, high = (
         row[name] if isinstance(row, pd.Series) else getattr(row, name)
         for name in ("value", "low", "high")
     )
+    if np.isnan(low):
+        return f"{value:z.{places}f} [-]"
     return f"{value:z.{places}f} [{low:z.{places}f}, {high:z.{places}f}]"
 
 

@@ -71,9 +71,9 @@ def test_groups_have_the_means_of_their_worlds_and_the_best_baseline():
         assert own["value"] == pytest.approx(0.1 + np.mean([levels[name] for name in names]))
         assert own["low"] < own["value"] - 1.0
         assert own["high"] > own["value"] + 1.0
-        best = of_row(table, group=group, what=f"{OURS} less the best (residual process)")
+        best = of_row(table, group=group, what=f"{OURS} minus the best (residual process)")
         assert best[["value", "low", "high"]].tolist() == pytest.approx([-0.1] * 3)
-        sight = of_row(table, group=group, what=f"{OURS} less line of sight")
+        sight = of_row(table, group=group, what=f"{OURS} minus line of sight")
         assert sight["value"] == pytest.approx(-0.8)
 
 
@@ -84,7 +84,7 @@ def test_worlds_of_one_terrain_enter_an_interval_together():
     table = by_group(made(
         lambda method, world, course: shift[world.ground] if method == OURS else 0.0
     ))  # fmt: skip
-    row = of_row(table, group="all", what=f"{OURS} less running mean")
+    row = of_row(table, group="all", what=f"{OURS} minus running mean")
     sd = np.std([shift[world.ground] for world in worlds().values()])
     assert (row["high"] - row["low"]) / (2 * 1.96) > 0.8 * sd / np.sqrt(len(terrains))
 
