@@ -15,7 +15,8 @@ from trustbo.hazard.risk import BoundRisk
 from trustbo.models import PooledTrust
 from trustbo.planning import NoPathError, Planner
 from trustbo.report import failed_bounds_of
-from trustbo.workspace.moves import bounds_along, bounds_and_next
+from trustbo.workspace.difficulty import difficulty_of
+from trustbo.workspace.moves import END, bounds_along, bounds_and_next
 
 ENDS = ((3, 0), (0, 3))
 PATH = ((3, 0), (2, 1), (1, 2), (0, 3))
@@ -287,3 +288,36 @@ def test_a_table_of_such_a_mission_is_read_and_told():
     campaign.tell(read)
     assert campaign.table()["state"].tolist() == ["learned", "learned"]
     assert campaign.risk.failures.sum() == 1
+
+
+@pytest.mark.parametrize("log", ["whole path", "up to the failure", "replanned"])
+def test_a_bound_that_stopped_robots_is_not_planned_again_with_its_next_move(log):
+    """Its failure may depend on the next move, which a log that ends or turns back lacks."""
+    robot = tb.Robot(max_slope=np.radians(25.0))
+    terrain = tb.terrain.synthetic_terrain((150.0, 150.0), 1.0, seed=2)
+    hilly = tb.Workspace.from_terrain(terrain, (4, 4), tb.Team(robots=(robot, robot), lead=robot))
+    campaign = tb.Campaign(hilly, *ENDS)
+    path = campaign.ask().path
+    k = 3
+    planned = tuple(bounds_and_next(path)[k])
+    before = campaign.risk.mean[planned]
+    of_units = difficulty_of(hilly).unit[planned[:3]]
+    assert of_units[planned[3]] not in (of_units[END], of_units[6])  # south is the way back
+
+    def told(cells, statuses):
+        n = len(statuses)
+        z = np.full((n, 2, len(hilly.features)), np.nan)
+        rates = np.full((n, 2), 0.9)
+        return tb.Mission.from_arrays(cells, z, rates, status=statuses, features=hilly.features)
+
+    stuck = ["ok"] * k + ["stuck"]
+    if log == "whole path":
+        campaign.tell(told(path, stuck))
+    elif log == "up to the failure":
+        campaign.tell(told(path[: k + 2], stuck))
+    else:
+        new = campaign.replan(path[k], told(path[: k + 2], stuck)).path
+        campaign.tell(told(new, stuck + ["ok"] * (len(new) - k - 2)))
+
+    assert campaign.risk.mean[planned] > max(0.1, 2.0 * before)
+    assert planned not in [tuple(bound) for bound in bounds_and_next(campaign.ask().path)]

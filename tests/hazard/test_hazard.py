@@ -12,7 +12,7 @@ from trustbo.errors import PosteriorError, TrustboError
 from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard, impute, sample
 from trustbo.hazard.risk import BoundRisk
-from trustbo.hazard.trials import LostMission, Trials
+from trustbo.hazard.trials import UNKNOWN, LostMission, Trials
 from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import END, MOVES
 
@@ -283,7 +283,8 @@ def test_each_bound_that_failed_counts_and_the_way_back_does_not():
     rates = np.full((n_bounds, 1), 0.5)
     counted = Trials.from_missions([tb.Mission.from_arrays(path, z, rates, status=ends)])
     east, north_east, west, south = 4, 2, 3, 6
-    expected = [[north_east, *c, END], [east, *b, east], [east, *c, west]]
+    # Where the robots had planned to go from c, before they got stuck, is not in the path.
+    expected = [[north_east, *c, END], [east, *b, east], [east, *c, UNKNOWN]]
     assert counted.bounds.tolist() == expected
     assert counted.n.tolist() == [1, 1, 1]
     assert counted.failed.tolist() == [0, 0, 1]
@@ -291,10 +292,45 @@ def test_each_bound_that_failed_counts_and_the_way_back_does_not():
     ends = "ok", "stuck", "tipped"  # on the way back
     stuck = tb.Mission.from_arrays(path, z[:3], rates[:3], status=ends)
     counted = Trials.from_missions([stuck])
-    expected = [[west, *b, south], [east, *b, east], [east, *c, west]]
+    expected = [[west, *b, south], [east, *b, east], [east, *c, UNKNOWN]]
     assert counted.bounds.tolist() == expected
     assert counted.n.tolist() == [1, 1, 1]
     assert counted.failed.tolist() == [1, 0, 1]
+
+
+def test_a_failure_whose_next_move_is_unknown_is_shared_by_all_next_moves():
+    a, b, c = (0, 0), (0, 1), (0, 2)
+    stuck = tb.Mission.from_arrays((a, b, c), np.full((2, 1, 1), 0.5), [[0.5], [0.5]], status=[
+        "ok", "stuck"
+    ])  # fmt: skip
+    lost = LostMission((a, b, c))
+    east, south = 4, 6
+
+    # A path that ends at its goal was planned to end there.
+    assert Trials.from_missions([stuck], goal=c).bounds.tolist() == [
+        [east, *b, east],
+        [east, *c, END],
+    ]
+    counted = Trials.from_missions([stuck], [lost], goal=(1, 2))
+    assert counted.bounds.tolist() == [[east, *b, east], [east, *c, UNKNOWN], [east, *c, END]]
+
+    # c has three next moves: south, the end of the path, and back, of which two are one unit.
+    unit = np.full((8, 2, 3, 9), -1)
+    unit[east, 0, 1, [east, END]] = east
+    unit[east, 0, 2, [south, END]] = south
+    unit[east, 0, 2, 3] = 3
+    shared = counted.with_known_next(unit)
+    assert shared.bounds[1:].tolist() == [[east, *c, 3], [east, *c, south], [east, *c, END]]
+    np.testing.assert_allclose(shared.failed, [0.0, 1 / 3, 1 / 3, 1 / 3])
+    np.testing.assert_allclose(shared.n, [1.0, 1 / 3, 1 / 3, 1 / 3])
+    np.testing.assert_allclose(shared.of_units(unit).failed, [0.0, 1 / 3, 2 / 3])
+    assert [shared.bounds[i].tolist() for i in shared.lost[0]] == [
+        [east, *b, east],
+        [east, *c, END],
+    ]
+
+    nowhere = counted.with_known_next(np.full(unit.shape, -1))
+    assert nowhere.bounds.tolist() == [[east, *b, east], [east, *c, END]]
 
 
 def test_a_failed_bound_has_a_higher_risk_and_a_completed_one_a_lower():

@@ -1,6 +1,7 @@
 """Learning from missions: the posterior, the hazard, and the planner of the next path."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import xarray as xr
@@ -23,6 +24,8 @@ _STOPPED = 2
 """Number of failures after which a bound is avoided."""
 _RECOVERED = 0.2
 """Failure probability below which such a bound is allowed again."""
+_ROUNDING = 1e-9
+"""Largest rounding error of an expected number of failures."""
 _HOPELESS = 0.9
 """Failure probability of the best path above which the safest path is planned instead."""
 
@@ -145,12 +148,20 @@ def learn_hazard(state: State, workspace: Workspace, so_far: Mission | None = No
     a warning.
     """
     measured = [mission for mission in state.earlier.missions if not mission.map]
-    measured += [entry.measured for entry in state.entries if not is_excluded_by_user(entry)]
+    measured += [
+        _with_planned_path(entry.measured, entry.plan)
+        for entry in state.entries
+        if not is_excluded_by_user(entry)
+    ]
     if so_far is not None:
-        measured.append(so_far)
+        plan = state.asked
+        measured.append(so_far if plan is None else _with_planned_path(so_far, plan))
+
     prior = Hazard(**state.settings["hazard"])
+    seed = state.seed_of("hazard")
+    goal = tuple(state.settings["goal"])
     try:
-        return fit_hazard(measured, workspace, prior, lost=state.lost, seed=state.seed_of("hazard"))
+        return fit_hazard(measured, workspace, prior, lost=state.lost, goal=goal, seed=seed)
     except PosteriorError as error:
         warn(f"{error} The campaign uses the previous hazard posterior.")
 
@@ -158,6 +169,17 @@ def learn_hazard(state: State, workspace: Workspace, so_far: Mission | None = No
     if last is not None:
         return last["hazard"].to_dataset()
     return fit_hazard([], workspace, prior)
+
+
+def _with_planned_path(mission: Mission, plan: Plan) -> Mission:
+    """Add the planned cells to the path of a mission that ends where its log ends.
+
+    The failure probability of a bound depends on the next move, which is then known.
+    """
+    n = len(mission.path)
+    if mission.status == "ok" or len(plan.path) <= n or plan.path[:n] != mission.path:
+        return mission
+    return replace(mission, path=plan.path)
 
 
 def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
@@ -172,17 +194,20 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     keep contact and never fail. The cost is computed jointly over components of the hazard
     posterior, because all bounds share the slope limit.
     """
-    n_failures = risk.stopped + 1e-9  # expected numbers, with rounding errors
-    stopped = (n_failures >= _STOPPED) & ~(risk.mean < _RECOVERED)
+    is_likely = ~(risk.mean < _RECOVERED)
+    n_failures = risk.stopped + _ROUNDING
+    stopped = (n_failures >= _STOPPED) & is_likely
 
     if planner.problem.failure_cost is None and not risk.has_failures:
         planner = planner.with_failure_cost(0.0)
 
     problem = planner.problem
     priced = problem.objective.of_contact and problem.failure_cost != 0.0
-    avoided = stopped.any(-1)
     if priced:
-        avoided &= (stopped | ~risk.exists).all(-1)
+        avoided = stopped.any(-1) & (stopped | ~risk.exists).all(-1)
+    else:
+        n_of_bounds = risk.stopped_with_any_next + _ROUNDING
+        avoided = (n_of_bounds >= _STOPPED) & (is_likely & risk.exists).any(-1)
     if avoided.any():
         planner = planner.avoiding(avoided, np.nanmax(risk.mean, axis=-1, initial=0.0))
 

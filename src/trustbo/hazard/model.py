@@ -22,7 +22,7 @@ import numpy as np
 import xarray as xr
 from scipy import special, stats
 
-from trustbo.data import Mission
+from trustbo.data import Cell, Mission
 from trustbo.errors import PosteriorError, TrustboError, require_whole
 from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, TILT, BoundPrior, Hazard
 from trustbo.hazard.risk import BoundRisk, add_lost
@@ -60,6 +60,7 @@ def fit_hazard(
     hazard: Hazard | None = None,
     *,
     lost: Sequence[LostMission] = (),
+    goal: Cell | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
     """Fit the failure probability of every bound and next move by importance sampling.
@@ -70,6 +71,8 @@ def fit_hazard(
             Without a terrain, all bounds have the same prior mean.
         hazard: Priors; by default `Hazard()`.
         lost: Failed missions without measurements.
+        goal: Last cell of all planned paths, if they have the same one. Otherwise, it is unknown
+            whether a path that ends at a bound that failed was planned to end there.
         seed: Random seed; the same seed gives the same posterior.
 
     Returns:
@@ -79,7 +82,9 @@ def fit_hazard(
         each mission lost at an unknown place failed. `p_fail` (move, row, col, next_move) is the
         posterior mean failure probability of a bound that is followed by a given next move or by
         the end of the path; it is NaN where there is no bound. `trials` and `failures`, of the same
-        shape, count known outcomes. `BoundRisk` draws failure probabilities.
+        shape, count known outcomes; a failure whose next move is unknown, because the robots turned
+        back or the log ends, is shared equally by all next moves. `BoundRisk` draws failure
+        probabilities.
 
     Raises:
         TrustboError: If the path of a mission skips cells or leaves the grid.
@@ -91,7 +96,7 @@ def fit_hazard(
     """
     started = time.perf_counter()
     hazard = hazard or Hazard()
-    trials = Trials.from_missions(missions, lost)
+    trials = Trials.from_missions(missions, lost, goal)
     difficulty = difficulty_of(workspace)
 
     measures = difficulty.measures
@@ -101,6 +106,8 @@ def fit_hazard(
     if outside.any():
         cell = tuple(cells[outside][0].tolist())
         raise TrustboError(f"a mission enters {cell}, outside the workspace of shape {shape}.")
+
+    trials = trials.with_known_next(difficulty.unit)
 
     # A bound that the robots drove, but that does not exist on the map, has the largest difficulty.
     units = trials.of_units(difficulty.unit)

@@ -108,13 +108,13 @@ class BoundRisk(Summary):
         is_bound = self.exists.any(-1)
         n_driven = int((self.trials.sum(-1)[is_bound] > 0).sum())
         n_unknown = len(self._lost)
-        failures = f"{int(self.failures.sum())} at a known bound"
+        failures = f"{self.failures.sum():.0f} at a known bound"
         if n_unknown:
             failures += f", {n_unknown} in an unknown bound of a path"
 
         return [
             ("bounds", f"{int(is_bound.sum())}, of which {n_driven} were driven"),
-            ("trials", f"{int(self.trials.sum())}"),
+            ("trials", f"{self.trials.sum():.0f}"),
             ("failures", failures),
             *_rows_of_failures(self.mean),
         ]
@@ -157,13 +157,26 @@ class BoundRisk(Summary):
 
         Next moves with the same steepest route share their failures.
         """
+        return np.nan_to_num(self._maps(self._expected_failures))
+
+    @cached_property
+    def stopped_with_any_next(self) -> np.ndarray:
+        """Posterior mean of the number of past failures of each bound, shape (move, row, col)."""
+        is_first = np.zeros(self._unit.shape, bool)
+        _, first = np.unique(self._unit[self.exists], return_index=True)
+        is_first[tuple(np.argwhere(self.exists)[first].T)] = True
+        return np.where(is_first, self.stopped, 0.0).sum(-1)
+
+    @cached_property
+    def _expected_failures(self) -> np.ndarray:
+        """Posterior mean of the number of past failures of each unit, shape (unit,)."""
         counts = self._failures.copy()
         for j, path in enumerate(self._lost):
             for k, bound in enumerate(path, start=1):
                 unit = self._unit[*bound]
                 if unit >= 0:
                     counts[unit] += (self._place[:, j] == k).mean()
-        return np.nan_to_num(self._maps(counts))
+        return counts
 
     def draw(self, n: int, seed: int = 0) -> np.ndarray:
         """Draw the failure probabilities, shape (draw, move, row, col, next_move).

@@ -1,7 +1,8 @@
 """Trials of bounds: how often each bound was begun and how often it ended a mission.
 
 Whether a bound is completed depends on the next move (see `workspace.difficulty`), so bounds are
-counted with their next moves.
+counted with their next moves. If robots turned back after a failure, or the log ends there, the
+path does not show the next move that was planned. Such a trial is shared equally by all next moves.
 """
 
 from collections.abc import Sequence
@@ -11,10 +12,12 @@ import numpy as np
 
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError
-from trustbo.workspace.moves import bounds_and_next
+from trustbo.workspace.moves import END, bounds_and_next
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
 """Statuses of bounds that failed; aborted bounds and missions do not count as failures."""
+UNKNOWN = -1
+"""Index of a next move that is not known."""
 
 
 class LostMission(NamedTuple):
@@ -36,8 +39,9 @@ class Trials(NamedTuple):
     Attributes:
         bounds: Distinct bounds in lexicographic order, shape (bound, 4). The columns are the index
             of the move in `MOVES`, the row and column of the cell entered, and the index of the
-            next move, which is `END` at the end of a path.
-        n: Number of trials with a known outcome, shape (bound,).
+            next move, which is `END` at the end of a path and `UNKNOWN` if it is not known.
+        n: Number of trials with a known outcome, shape (bound,). It is a fraction if trials are
+            shared by several next moves; see `with_known_next`.
         failed: Number of failures among the trials in `n`, shape (bound,).
         lost: Planned bounds of each mission lost at an unknown place, as indices into `bounds`.
     """
@@ -48,17 +52,28 @@ class Trials(NamedTuple):
     lost: tuple[np.ndarray, ...]
 
     @classmethod
-    def from_missions(cls, missions: Sequence[Mission], lost: Sequence[LostMission] = ()) -> Self:
+    def from_missions(
+        cls,
+        missions: Sequence[Mission],
+        lost: Sequence[LostMission] = (),
+        goal: Cell | None = None,
+    ) -> Self:
         """Count the trials in measured missions and in lost missions.
 
         The last bound of a failed mission counts as a failure, and so does each earlier bound that
         failed. An aborted bound is not counted. If the robots turn back during a bound, they drive
         only a part of the bound that leads back, so this bound is counted only if it fails.
 
+        Args:
+            missions: Measured missions.
+            lost: Failed missions without measurements.
+            goal: Last cell of all planned paths, if they have the same one. A path that ends in
+                another cell at a bound that failed has an unknown next move.
+
         Raises:
             TrustboError: If a path skips cells or does not enter `where`.
         """
-        known = [_reported(mission) for mission in missions]
+        known = [_reported(mission, goal) for mission in missions]
         known += [_located(mission) for mission in lost if mission.where is not None]
         unknown = [bounds_and_next(mission.path) for mission in lost if mission.where is None]
 
@@ -72,6 +87,38 @@ class Trials(NamedTuple):
             np.add.at(n, path, 1.0)
             np.add.at(failed, path, fails)
         return cls(bounds, n, failed, tuple(paths[len(known) :]))
+
+    def with_known_next(self, unit: np.ndarray) -> Self:
+        """Share each trial with an unknown next move equally among the next moves that exist.
+
+        Args:
+            unit: See `of_units`.
+        """
+        is_unknown = self.bounds[:, 3] == UNKNOWN
+        if not is_unknown.any():
+            return self
+
+        source = [np.flatnonzero(~is_unknown)]
+        after = [self.bounds[~is_unknown, 3]]
+        share = [np.ones(len(source[0]))]
+        for row in np.flatnonzero(is_unknown):
+            moves = np.flatnonzero(unit[*self.bounds[row, :3]] >= 0)
+            moves = moves if moves.size else np.array([END])  # the bound is not on the map
+            source.append(np.full(len(moves), row))
+            after.append(moves)
+            share.append(np.full(len(moves), 1.0 / len(moves)))
+
+        of_row = np.concatenate(source)
+        shares = np.concatenate(share)
+        rows = np.column_stack([self.bounds[of_row, :3], np.concatenate(after)])
+        bounds, index = np.unique(rows, axis=0, return_inverse=True)
+        n = np.bincount(index, shares * self.n[of_row], len(bounds))
+        failed = np.bincount(index, shares * self.failed[of_row], len(bounds))
+
+        # The bounds of lost missions have known next moves, which come first in `rows`.
+        place = np.zeros(len(self.bounds), int)
+        place[of_row[: len(source[0])]] = index[: len(source[0])]
+        return type(self)(bounds, n, failed, tuple(place[path] for path in self.lost))
 
     def of_units(self, unit: np.ndarray) -> Self:
         """Add up the trials of each unit, whose next moves pass or fail together.
@@ -91,7 +138,7 @@ class Trials(NamedTuple):
         return type(self)(bounds, n, failed, tuple(index[path] for path in self.lost))
 
 
-def _reported(mission: Mission) -> tuple[np.ndarray, np.ndarray]:
+def _reported(mission: Mission, goal: Cell | None) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds with a known outcome, (bound, 4), and whether each one failed."""
     path = mission.path
     statuses = mission.statuses
@@ -103,8 +150,15 @@ def _reported(mission: Mission) -> tuple[np.ndarray, np.ndarray]:
         if status == "ok" and not goes_back:
             is_known[k] = True
 
-    # The path is the planned one, so the next move is also known for the last bound.
+    # A path contains the planned cells after the last bound, unless the log ends there or the
+    # mission was replanned. Robots that turn back after a failure did not plan to.
     tried = bounds_and_next(path[: len(statuses) + 2])[: len(statuses)]
+    for k in np.flatnonzero(fails):
+        is_last = k + 2 == len(path)
+        turns_back = not is_last and path[k + 2] == path[k]
+        if turns_back or (is_last and path[k + 1] != goal):
+            tried[k, 3] = UNKNOWN
+
     return tried[is_known], fails[is_known]
 
 
