@@ -7,9 +7,11 @@
   shows how often the rule stops a campaign, and how often the true regret of the recommended path
   is then at most 5 %.
 
-Worlds and courses are those of `benchmarks/worlds.py`. Truths are kept in --out.
+Worlds and courses are those of `benchmarks/worlds.py`. Truths and finished campaigns are kept in
+--out.
 """
 
+import json
 from functools import partial
 from typing import Any
 
@@ -42,7 +44,8 @@ def campaign_of(scene: Any) -> tb.Campaign:
     return tb.Campaign(scene.workspace, scene.start, scene.goal, **scene.options)
 
 
-def band(scenes: dict[str, Any]) -> None:
+def band(scenes: dict[str, Any], given: Any) -> None:
+    """Print how often the band of the first plan contains the true value, by kind of world."""
     found: dict[str, list[tuple[float, float, float, float]]] = {}
     for (kind, _, _), make in scenes.items():
         scene = make()
@@ -59,31 +62,63 @@ def band(scenes: dict[str, Any]) -> None:
     table.row("all", len(every), *(f"{x:.2f}" for x in every.mean(0)))
 
 
-def regret(scenes: dict[str, Any]) -> None:
-    rule = tb.RegretBound(eps=0.05, delta=0.1)
-    stopped = []
-    for make in scenes.values():
-        scene = make()
-        campaign = campaign_of(scene)
-        for _ in campaign.run(scene.simulator, MISSIONS, stop=rule):
-            pass
-        if not campaign.state.stop_reason.startswith("regret_bound"):
-            stopped.append((False, np.nan, np.nan))
-            continue
-        n = len(campaign.missions)
-        truth = scene.truth.at(n)
-        stopped.append((True, truth.regret(campaign.path, MAX_BOUNDS), n))
+def regret(scenes: dict[str, Any], given: Any) -> None:
+    """Print how often `RegretBound` stops, and the true regret of what is then recommended.
 
-    every = np.array(stopped, dtype=float)
-    some = every[every[:, 0] == 1.0]
-    table = Table("courses", "stopped", "true regret <= 5 %", "median regret, %", "mean missions")
-    table.row(
-        len(every),
-        len(some),
-        f"{np.mean(some[:, 1] <= 5.0):.2f}" if len(some) else "-",
-        f"{np.median(some[:, 1]):.2f}" if len(some) else "-",
-        f"{some[:, 2].mean():.1f}" if len(some) else "-",
+    Each campaign has a file in --out, so the script can be resumed. The order of the campaigns is
+    random, so those of a run that was interrupted are a random sample (`--finished`).
+    """
+    folder = given.out / "regret"
+    folder.mkdir(parents=True, exist_ok=True)
+    names = list(scenes)
+    rows = []
+    for k in np.random.default_rng(0).permutation(len(names)):
+        file = folder / f"{'~'.join(names[k])}.json"
+        if not file.exists():
+            if given.finished:
+                continue
+            file.write_text(json.dumps(stopped_campaign(scenes[names[k]]())) + "\n")
+        rows.append({"kind": names[k][0], **json.loads(file.read_text())})
+
+    table = Table(
+        "kind", "courses", "stopped", "true regret <= 5 %", "median regret, %", "mean missions"
     )
+    for kind in [*dict.fromkeys(name[0] for name in names), "all"]:
+        chosen = [row for row in rows if kind in (row["kind"], "all")]
+        if chosen:
+            table.row(kind, *figures_of(chosen))
+
+
+def stopped_campaign(scene: Any) -> dict[str, Any]:
+    """Run a campaign until the rule stops it, and compute the true regret."""
+    rule = tb.RegretBound(eps=0.05, delta=0.1)
+    campaign = campaign_of(scene)
+    for _ in campaign.run(scene.simulator, MISSIONS, stop=rule):
+        pass
+
+    n = len(campaign.missions)
+    return {
+        "stopped": (campaign.state.stop_reason or "").startswith("regret_bound"),
+        "missions": n,
+        "regret": scene.truth.at(n).regret(campaign.path, MAX_BOUNDS),
+    }
+
+
+def figures_of(rows: list[dict[str, Any]]) -> list[str]:
+    """Format the figures of some campaigns; regrets are those of campaigns that were stopped."""
+    stopped = [row for row in rows if row["stopped"]]
+    if not stopped:
+        return [str(len(rows)), "0", "-", "-", "-"]
+
+    regrets = np.array([row["regret"] for row in stopped])
+    missions = np.mean([row["missions"] for row in stopped])
+    return [
+        str(len(rows)),
+        str(len(stopped)),
+        f"{np.mean(regrets <= 5.0):.2f}",
+        f"{np.median(regrets):.2f}",
+        f"{missions:.1f}",
+    ]
 
 
 PARTS = {"band": band, "regret": regret}
@@ -91,8 +126,9 @@ PARTS = {"band": band, "regret": regret}
 if __name__ == "__main__":
     parser = arguments(__doc__, names=PARTS, data=True, out="out/first_plan")
     parser.add_argument("--set", action="store_true", help="smaller set: 17 worlds x 2 courses")
+    parser.add_argument("--finished", action="store_true", help="print only finished campaigns")
     given = parsed(parser)
     scenes = scenes_of(given)
     for name in given.names:
         print(name, flush=True)
-        PARTS[name](scenes)
+        PARTS[name](scenes, given)
