@@ -1,8 +1,9 @@
 """Compare what a campaign says before and after a few missions with the truth of worlds.
 
-    python benchmarks/first_plan.py [band] [regret] [--data DIR] [--set] [--out DIR]
+    python benchmarks/first_plan.py [band] [width] [regret] [--data DIR] [--set] [--out DIR]
 
 - band: coverage of the 90 % band of the first plan's value, before any mission, by kind of world.
+- width: width of this band on the example hillside, with narrower priors and without effects.
 - regret: coverage of `tb.RegretBound(eps=0.05, delta=0.1)` in campaigns of 15 missions. The table
   shows how often the rule stops a campaign, and how often the true regret of the recommended path
   is then at most 5 %.
@@ -12,19 +13,24 @@ Worlds and courses are those of `benchmarks/worlds.py`. Truths and finished camp
 """
 
 import json
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+import numpyro.distributions as dist
 from common import Table, arguments, parsed
 from worlds import SET, SET_COURSES
 
 import trustbo as tb
+from trustbo.models import PlaceEffect, PooledTrust, Priors, RobotEffect
 from trustbo.study import worlds
 from trustbo.study.world import COURSES
 
 MAX_BOUNDS = "shortest+4"
 MISSIONS = 15
+SCALES = (1.0, 0.5, 0.1)
+"""Factors of the prior standard deviations in `width`."""
 
 
 def scenes_of(given: Any) -> dict[str, Any]:
@@ -60,6 +66,37 @@ def band(scenes: dict[str, Any], given: Any) -> None:
         table.row(kind, len(rows), *(f"{x:.2f}" for x in of_kind.mean(0)))
     every = np.array([row for rows in found.values() for row in rows])
     table.row("all", len(every), *(f"{x:.2f}" for x in every.mean(0)))
+
+
+def width(scenes: dict[str, Any], given: Any) -> None:
+    """Print the width of the first plan's band for several priors and effects."""
+    workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10), tb.Team())
+    priors = Priors.from_features(workspace.features)
+    every = (PlaceEffect(), RobotEffect())
+    effects_of = {
+        "places and robots": every,
+        "places": every[:1],
+        "robots": every[1:],
+        "none": (),
+    }
+
+    table = Table("effects", *(f"width, sds of weights x {scale:g}" for scale in SCALES))
+    for name, effects in effects_of.items():
+        widths = []
+        for scale in SCALES:
+            model = PooledTrust(scaled(priors, scale), effects=effects)
+            low, high = tb.Campaign(workspace, (9, 0), (0, 9), model=model).ask().value_band
+            widths.append(f"{high - low:.1f}")
+        table.row(name, *widths)
+
+
+def scaled(priors: Priors, scale: float) -> Priors:
+    """Multiply the prior standard deviations of the weights and of the intercept by a factor."""
+    normals = {
+        name: dist.Normal(getattr(priors, name).loc, scale * getattr(priors, name).scale)
+        for name in ("beta", "b")
+    }
+    return replace(priors, **normals)
 
 
 def regret(scenes: dict[str, Any], given: Any) -> None:
@@ -121,7 +158,7 @@ def figures_of(rows: list[dict[str, Any]]) -> list[str]:
     ]
 
 
-PARTS = {"band": band, "regret": regret}
+PARTS = {"band": band, "width": width, "regret": regret}
 
 if __name__ == "__main__":
     parser = arguments(__doc__, names=PARTS, data=True, out="out/first_plan")
