@@ -59,8 +59,10 @@ BRIGHT_HIGH = "viridis"
 """Colours of maps in which high values are good."""
 BRIGHT_LOW = "viridis_r"
 """Colours of maps in which low values are good."""
-_WIDE_ENOUGH = 4.0
-"""Width of a figure, in inches, from which the label of a colour bar may explain its ends."""
+_LEAST_SIZE = (4.0, 1.7)
+"""Width and height of a figure, in inches, from which the label of a colour bar may explain its
+ends; in smaller figures, the explanation does not fit.
+"""
 _HATCH = {"hatch": "////", "edgecolor": (0.4, 0.4, 0.4, 0.65), "linewidth": 0.0}
 """Style of cells that no mission entered."""
 _LONGEST_BAR = 0.4
@@ -336,7 +338,7 @@ def trust_bar(
 ) -> None:
     """Draw a colour bar of trust; an upper end of 1 is labelled "≥ 1" if values exceed 1.
 
-    Unless `explain` is false, the label of the bar in a wide figure explains that 1 is unbroken
+    Unless `explain` is false, the label of the bar in a large figure explains that 1 is unbroken
     contact.
     """
     bar = colour_bar(axes, image, label, extend=_extend(values, image.norm))
@@ -344,9 +346,9 @@ def trust_bar(
         return
 
     is_above = bool((values[np.isfinite(values)] > 1.0).any())
-    if explain and figure_of(axes).get_figwidth() >= _WIDE_ENOUGH:
-        more = ";\nestimates can be higher" if is_above else ""
-        bar.set_label(f"{label}\n(1: unbroken contact{more})")
+    if explain and (figure_of(axes).get_size_inches() >= _LEAST_SIZE).all():
+        more = "; estimates\ncan be higher" if is_above else ""
+        bar.set_label(f"{label}\n(1: unbroken\ncontact{more})")  # short lines, as bars are short
     if is_above:
         bar.formatter = FuncFormatter(lambda x, _: "≥ 1" if math.isclose(x, 1.0) else f"{x:.4g}")
         bar.update_ticks()
