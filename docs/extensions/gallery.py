@@ -24,6 +24,8 @@ _DPI = 110
 _NOTEBOOKS = (
     "Jupyter notebooks with their outputs; `make jupyter` installs JupyterLab and opens them."
 )
+_PICTURES = {"compare_models": 3}
+"""Index of the stored picture of a notebook that is shown; by default, the first one."""
 _START, _GOAL = (7, 0), (0, 3)
 
 
@@ -67,17 +69,21 @@ def figures() -> Iterator[Figure]:
 
     yield Figure(
         "trustbo.plots.terrain_maps", lambda: plots.terrain_maps(workspace),
-        "Height and awareness: traversability and visibility of the terrain.",
+        "Height of the surface, and the three features of awareness. Line of sight is averaged "
+        "over moves and robots. Grey cells are impassable.",
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.trust_maps",
         lambda: plots.trust_maps(*maps, workspace, missions=(1, 2)),
-        "Trust maps before mission 1, and after missions 1 and 6, with the next path.",
+        "Trust maps before mission 1, and after missions 1 and 6, with the next path. The path "
+        "stays the same, but the contact measured on it also changes the trust in other cells.",
         wide=True,
     )
     yield Figure(
         "trustbo.plots.trust_curves", lambda: plots.trust_curves(result.posterior),
-        "Trust in each robot along the last mission; the lidar of r2 is damaged.", wide=True,
+        "Trust in each robot along the last mission; the lidar of r2 is damaged. The bands are for "
+        "trust, not for single contact rates, so dots may lie outside the bands.",
+        wide=True,
     )  # fmt: skip
     yield Figure(
         "trustbo.Result.plot_history", lambda: result.plot_history(),
@@ -89,7 +95,9 @@ def figures() -> Iterator[Figure]:
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.robot_effects", lambda: plots.robot_effects(robots),
-        "Effect of each robot in each mission: r2 loses contact in all missions.",
+        "Effect of each robot in each mission, with bars of two standard deviations, which are "
+        "shorter than the markers here. Effects in the grey band hardly change a plan. Filled "
+        "markers show that r2 stands out from the team: it loses contact in all missions.",
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.cell_map", lambda: plots.cell_map(sd, workspace, path=result.path),
@@ -105,7 +113,8 @@ def figures() -> Iterator[Figure]:
     )  # fmt: skip
     yield Figure(
         "arviz.plot_ppc_dist", predictions,
-        "Posterior predictive check: measured contact rates (black) and predicted ones.",
+        "Posterior predictive check: measured contact rates (black) and predicted ones. Rates of "
+        "exactly 1 are more frequent than the Gaussian family predicts, and predictions exceed 1.",
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.explore",
@@ -181,17 +190,16 @@ def _figure(name: str, caption: str, wide: bool) -> str:
 
 
 def _notebook(path: Path) -> str:
-    """Save the first picture stored in a notebook; return its text, which links to the notebook."""
+    """Save a picture stored in a notebook; return its text, which links to the notebook."""
     notebook = json.loads(path.read_text())
     title = "".join(notebook["cells"][0]["source"]).splitlines()[0].removeprefix("# ")
     outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
     pictures = [o["data"]["image/png"] for o in outputs if "image/png" in o.get("data", {})]
-    (FOLDER / f"{path.stem}.png").write_bytes(base64.b64decode(pictures[0]))
+    shown = pictures[_PICTURES.get(path.stem, 0)]
+    (FOLDER / f"{path.stem}.png").write_bytes(base64.b64decode(shown))
 
     page = f"notebooks/{path.stem}"
-    return _entry(
-        f"{path.stem}.png", f"First figure of {title}", f"{page}.html", f"{{doc}}`{page}`"
-    )
+    return _entry(f"{path.stem}.png", f"Figure of {title}", f"{page}.html", f"{{doc}}`{page}`")
 
 
 def _entry(picture: str, alt: str, target: str, caption: str, *, wide: bool = False) -> str:

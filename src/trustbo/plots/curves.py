@@ -187,8 +187,8 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
 def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     """Plot the effect of each robot in each mission, with bars of two standard deviations.
 
-    The grey band marks effects too small to change a plan. Filled markers show robots that stand
-    out from the team.
+    The grey band marks effects that hardly change a plan. Filled markers show robots that stand out
+    from the team. Bars that are shorter than the marker are hidden.
 
     Args:
         table: Table `robots` of a `tb.check`, with one row for each mission and robot. Its columns
