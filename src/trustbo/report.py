@@ -150,13 +150,13 @@ def _uncertain(result: Result) -> str:
     widest = int(np.argmax(high - low))
     text = (
         f"{known}; trust is least certain in bound {widest + 1} into cell "
-        f"{_name(plan.path[widest + 1])}, {low[widest]:.2f} to {high[widest]:.2f} with 90 % "
+        f"{_name(plan.path[widest + 1])}, {low[widest]:z.2f} to {high[widest]:z.2f} with 90 % "
         "probability"
     )
     if plan.value_band is not None:
         text += (
-            f"; the objective is {plan.value:.3g} ({plan.value_band[0]:.3g} to "
-            f"{plan.value_band[1]:.3g} in 90 % of the draws)"
+            f"; the objective is {plan.value:z.3g} ({plan.value_band[0]:z.3g} to "
+            f"{plan.value_band[1]:z.3g} in 90 % of the draws)"
         )
     return text
 
@@ -334,7 +334,7 @@ def _note(text: str) -> _Block:
 
 def _table(frame: pd.DataFrame) -> _Block:
     html = frame.reset_index().to_html(
-        index=False, border=0, float_format=lambda x: f"{x:.3g}", na_rep="-"
+        index=False, border=0, float_format=lambda x: f"{x:z.3g}", na_rep="-"
     )
     return _Block(table=html)
 

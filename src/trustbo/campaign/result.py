@@ -105,7 +105,7 @@ class Result(Summary):
         ]
 
         if state.last is not None:
-            best = f"{len(self.path) - 1} bounds, value {self.plan.value:.3g}"
+            best = f"{len(self.path) - 1} bounds, value {self.plan.value:z.3g}"
             rows.append(("recommended", best))
         if state.entries and state.last is not None:
             rows.append(("last mission", in_a_line(state.entries[-1].row)))
@@ -485,5 +485,5 @@ def load_result(
 def in_a_line(row: dict[str, Any]) -> str:
     """Describe a mission in one line, with the diagnostics of the posterior after the mission."""
     names = ("objective", "contact_rate", "k_hat", "kish", "r_hat", "ess_bulk")
-    numbers = [f"{name} {row[name]:.3g}" for name in names if name in row]
+    numbers = [f"{name} {row[name]:z.3g}" for name in names if name in row]
     return ", ".join([row["status"], row["state"], *numbers])

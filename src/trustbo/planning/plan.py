@@ -76,17 +76,17 @@ class Plan(Summary):
         return replace(self, bands=given.bands, value_band=given.value_band)
 
     def _rows(self) -> Rows:
-        best = "no path is better" if self.exact else f"no path exceeds {self.limit:.3g}"
+        best = "no path is better" if self.exact else f"no path exceeds {self.limit:z.3g}"
         if np.isnan(self.limit):
             best = "not known: the path was given or chosen by a policy"
 
         within = ""
         if self.value_band is not None:
-            within = ", {:.3g} to {:.3g} in 90 % of the draws".format(*self.value_band)
+            within = ", {:z.3g} to {:z.3g} in 90 % of the draws".format(*self.value_band)
 
         rows = [
             ("path", f"{path_text(self.path)}: {len(self.path) - 1} bounds, {self.length:.0f} m"),
-            ("value", f"{self.value:.3g} ({self.objective})" + within),
+            ("value", f"{self.value:z.3g} ({self.objective})" + within),
             ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]

@@ -29,7 +29,7 @@ from trustbo.workspace.grid import Grid, over_cells
 
 _PLANNED_ON = "trust map used to plan the mission"
 _MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "plus")
-_HEIGHT = 640
+_HEIGHT = 800
 """Height of the page in a notebook, pixels."""
 _WIDTH = 600
 """Width for which the height of the map is chosen, pixels."""
@@ -303,9 +303,9 @@ def _title(name: str, maps: xr.Dataset, limits: tuple[float, float]) -> str:
 def _text(mission: xr.Dataset, objective: str) -> str:
     """Describe a mission in one line of HTML."""
     value = float(mission["objective"])
-    predicted = f"predicted objective {value:.3f}"
+    predicted = f"predicted objective {value:z.3f}"
     if objective == "lost_contact":
-        predicted = f"contact lost {_lost(mission)}, predicted {-value:.2f} bounds"
+        predicted = f"contact lost {_lost(mission)}, predicted {-value:z.2f} bounds"
     return (
         f"<b>Mission {int(mission['iteration'])}</b>: {escape(str(mission['status'].item()))}, "
         f"contact rate {float(mission['contact_rate']):.3f}, "
@@ -317,4 +317,4 @@ def _text(mission: xr.Dataset, objective: str) -> str:
 def _lost(mission: xr.Dataset) -> str:
     """Return the contact that a mission lost, as text."""
     lost = float(mission["contact_lost"]) if "contact_lost" in mission else np.nan
-    return f"{lost:.2f}" if np.isfinite(lost) else "not measured"
+    return f"{lost:z.2f}" if np.isfinite(lost) else "not measured"
