@@ -4,7 +4,8 @@
                       k. Bound 0 is the start of a mission, in its start cell, and may have "path",
                       the planned cells.
     /mission/status   std_msgs/String, "ok", "stuck", ..., optional, at the end of a bound
-    /{robot}/contact  std_msgs/Bool, or Float32 or Float64 in [0, 1], at each tick
+    /{robot}/contact  std_msgs/Bool, or Float32 or Float64 in [0, 1], at each tick: whether the
+                      robot detects the lead or, while T2 closes up, the lead detects the robot
 
 A bound lasts from its marker to its status or, without a status, to the last contact message
 before the next marker. Its contact rate is the fraction of a robot's ticks with contact; NaN ticks

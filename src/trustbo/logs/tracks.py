@@ -30,9 +30,11 @@ def read_tracks(
 ) -> list[Mission]:
     """Read a log of poses and detections as missions, one for each lead, which all robots watch.
 
-    The contact rate of a robot in a bound is the fraction of ticks in which it detected the lead,
-    counting only the `n_ticks` ticks in which both poses are known. Poses are interpolated if they
-    are at most 5 s apart.
+    The contact rate of a robot in a bound is the fraction of ticks with a detection in which the
+    robot is the `watcher` and the lead is `seen`, counting only the `n_ticks` ticks in which both
+    poses are known. Poses are interpolated if they are at most 5 s apart. Phases of a bound are not
+    distinguished: while T2 closes up, contact means that the lead detects the robot, so exchange
+    `watcher` and `seen` in the lead's detections of this phase.
 
     With a workspace, the result is one mission for `Campaign.tell`, with the robots and features of
     the workspace and without measured awareness. A bound begins where the lead enters the next cell
