@@ -37,7 +37,8 @@ class Hazard:
     Attributes:
         intercept: Prior on the logit of the mean failure probability at medium difficulty.
         coefficient: Prior on the weight of each difficulty measure. Difficulty is 0 for an easy
-            route and 1 at the robots' limit. Tilt has no weight, as the slope limit includes it.
+            route and 1 at the robots' limit. The tilt of a bound is not a difficulty measure, so it
+            has no weight; it is compared with the slope limit instead (`margin`, `log_width`).
         margin: Prior on the number of degrees by which the true slope limit is below the stated
             limit, if the stated limit is approximately correct. All bounds share the margin, so a
             failure on one bound makes failures on equally steep bounds more probable.

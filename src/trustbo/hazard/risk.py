@@ -39,7 +39,8 @@ class BoundRisk(Summary):
     Attributes:
         exists: Whether each bound exists and can be followed by the next move, shape (move, row,
             col, next_move).
-        trials: Number of trials with a known outcome, shape (move, row, col, next_move).
+        trials: Number of times that each bound is known to have been completed or to have failed,
+            shape (move, row, col, next_move).
         failures: Number of failures at a known bound, shape (move, row, col, next_move).
         steepness: Degrees by which each bound exceeds the stated slope limit, shape (move, row,
             col, next_move); None without a limit.

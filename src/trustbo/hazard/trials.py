@@ -40,8 +40,9 @@ class Trials(NamedTuple):
         bounds: Distinct bounds in lexicographic order, shape (bound, 4). The columns are the index
             of the move in `MOVES`, the row and column of the cell entered, and the index of the
             next move, which is `END` at the end of a path and `UNKNOWN` if it is not known.
-        n: Number of trials with a known outcome, shape (bound,). It is a fraction if trials are
-            shared by several next moves; see `with_known_next`.
+        n: Number of times that each bound is known to have been completed or to have failed, shape
+            (bound,). It is a fraction if trials are shared by several next moves; see
+            `with_known_next`.
         failed: Number of failures among the trials in `n`, shape (bound,).
         lost: Planned bounds of each mission lost at an unknown place, as indices into `bounds`.
     """
@@ -139,7 +140,7 @@ class Trials(NamedTuple):
 
 
 def _reported(mission: Mission, goal: Cell | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounds with a known outcome, (bound, 4), and whether each one failed."""
+    """Return the bounds that were completed or failed, (bound, 4), and whether each one failed."""
     path = mission.path
     statuses = mission.statuses
 
