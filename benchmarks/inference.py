@@ -4,7 +4,8 @@
 
 `fits`: CPU time of fits of the default model to 3, 15, 60 and 200 missions, and of fits with shared
 noise and with censored rates. A `later` fit starts from the posterior of the fit to one mission
-fewer, as in a campaign. The first fit of the process, to 3 missions, has its own row.
+fewer, as in a campaign. The first fit of the process, to 3 missions, has its own row. Missions are
+on different random paths, or on 10 paths, as in a campaign that repeats its paths.
 `nuts`: CPU time of `sampler="nuts"` for the default model and eight missions, with compilation, and
 the difference of the means from those of importance sampling.
 `accuracy`: errors of the posterior means of fits with 10 x --seeds seeds, in posterior standard
@@ -53,6 +54,8 @@ FITS = {
     "default model, 15 missions": (15, DEFAULT),
     "default model, 60 missions": (60, DEFAULT),
     "default model, 200 missions": (200, DEFAULT),
+    "default model, 60 missions on 10 paths": (60, DEFAULT),
+    "default model, 200 missions on 10 paths": (200, DEFAULT),
     "shared noise, 15 missions": (15, SHARED),
     "censored rates, 15 missions": (15, CENSORED),
 }
@@ -62,11 +65,13 @@ NAMES = ("beta0", "delta_w")
 """Parameters whose draws and means are compared in `paper`."""
 
 
-def missions(n, n_bounds=10, size=10, limit=False, seed=0):
-    """Simulate missions of three robots on random walks."""
+def missions(n, n_bounds=10, size=10, limit=False, seed=0, n_paths=None):
+    """Simulate missions of three robots on random walks, which repeat after `n_paths` missions."""
     rng, found = np.random.default_rng(seed), []
-    for _ in range(n):
+    for j in range(n):
         path = [tuple(rng.integers(size, size=2).tolist())]
+        if n_paths is not None and j >= n_paths:
+            path = list(found[j % n_paths].path)
         while len(path) <= n_bounds:
             step = np.array(path[-1]) + rng.integers(-1, 2, size=2)
             if (step >= 0).all() and (step < size).all() and tuple(step.tolist()) != path[-1]:
@@ -108,7 +113,7 @@ def timed_fits(given):
 def one_case(table, name, n_seeds, later=False, label=""):
     """Add the row of a fit; if `later`, it starts from the posterior of one mission fewer."""
     n, model = FITS[name]
-    data = missions(n, limit=model is CENSORED)
+    data = missions(n, limit=model is CENSORED, n_paths=10 if "10 paths" in name else None)
     options = {"latent": False, "check": False}
     if later:
         options["start"] = tb.fit(data[:-1], model, **options)
