@@ -1,8 +1,10 @@
 """Commands: what they write, how they fail, and that their help imports nothing heavy."""
 
+import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import rasterio
 from worlds import hillside
@@ -83,6 +85,25 @@ def test_info_describes_and_draws_the_grid(rasters, tmp_path, capsys):
     assert call("info", *files, "--shape", "3,3", "--out", picture) == 0
     assert "3 x 3" in capsys.readouterr().out
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_info_states_the_slope_limit_and_the_cells_that_are_passable_with_it(
+    rasters, tmp_path, capsys
+):
+    files = rasters / "dem.tif", rasters / "dsm.tif"
+
+    def stated(*words):
+        """Degrees, passable cells and all cells in the printed line."""
+        assert call("info", *files, "--shape", "3,3", "--out", tmp_path / "grid.png", *words) == 0
+        [line] = [x for x in capsys.readouterr().out.splitlines() if x.startswith("slope limit")]
+        return [int(number) for number in re.findall(r"\d+", line)]
+
+    terrain = tb.terrain.read_terrain(*files)
+    for degrees, words in ((45, ()), (12, ("--max-slope", "12"))):
+        robot = tb.Robot(max_slope=np.radians(degrees))
+        team = tb.Team(robots=(robot,) * 3, lead=robot)
+        workspace = tb.Workspace.from_terrain(terrain, (3, 3), team)
+        assert stated(*words) == [degrees, int(workspace.passable.sum()), 9]
 
 
 @pytest.mark.parametrize(

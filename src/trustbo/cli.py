@@ -176,6 +176,7 @@ def info(args: argparse.Namespace) -> None:
 
     workspace = _workspace(args)
     print(workspace)
+    print(_passable(workspace))
     plt.switch_backend("agg")
     tb.plots.grid_map(workspace)
     plt.savefig(args.out, dpi=150)
@@ -194,6 +195,8 @@ def run(args: argparse.Namespace) -> None:
     given = {"policy": args.policy, "objective": args.objective}
     options |= {name: value for name, value in given.items() if value is not None}
     workspace = _workspace(args, args.start, args.goal, **features)
+    if not args.quiet:
+        print(_passable(workspace))
     _run(args, workspace, start=args.start, goal=args.goal, **options, stop=_stop(args))
 
 
@@ -210,6 +213,18 @@ def _workspace(args: argparse.Namespace, *ends: Any, **features: Any) -> "Worksp
     robot = tb.Robot(max_slope=radians(args.max_slope))
     team = tb.Team(robots=(robot,) * args.robots, lead=robot)
     return tb.Workspace.from_terrain(terrain, args.shape, team, **features)
+
+
+def _passable(workspace: "Workspace") -> str:
+    """Return, as text, the robots' slope limit and how many cells are passable with it."""
+    from math import degrees
+
+    limit = degrees(workspace.team.max_slope)
+    n_passable = int(workspace.passable.sum())
+    return (
+        f"slope limit of the robots: {limit:.3g} degrees; {n_passable} of "
+        f"{workspace.passable.size} cells are passable"
+    )
 
 
 def _run(args: argparse.Namespace, workspace: "Workspace", **options: Any) -> None:
