@@ -5,9 +5,14 @@ import os
 import runpy
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
+from numba import njit
+
+from trustbo.kernels import stopwatch
 
 ROOT = Path(__file__).resolve().parents[1]
 REACH_EVERY_KERNEL = (
@@ -68,3 +73,38 @@ def test_two_thousand_random_plans_keep_within_their_arrays(tmp_path):
     ended = run(words, **checked(tmp_path))
     assert ended.returncode == 0, ended.stdout[-3000:] + ended.stderr[-3000:]
     assert ended.stdout.splitlines()[-1].startswith("2000 problems, 0 wrong")
+
+
+def compile_something():
+    """Compile and call a kernel that calls another one; return the seconds that this took."""
+
+    @njit
+    def inner(x):
+        return x + 1.0
+
+    @njit
+    def outer(x):
+        return inner(x) * inner(2.0 * x)
+
+    started = time.perf_counter()
+    outer(1.0)
+    return time.perf_counter() - started
+
+
+def test_a_stopwatch_stands_still_during_compilation():
+    with stopwatch() as elapsed:
+        compiled = compile_something()
+        assert 0.0 < elapsed() < 0.5 * compiled
+
+        before = elapsed()
+        time.sleep(0.05)
+        assert elapsed() - before >= 0.05
+
+
+def test_a_stopwatch_runs_while_another_thread_compiles():
+    seconds = []
+    other = threading.Thread(target=lambda: seconds.append(compile_something()))
+    with stopwatch() as elapsed:
+        other.start()
+        other.join()
+        assert elapsed() >= seconds[0]

@@ -1,11 +1,15 @@
 """Numba decorator of all kernels: loops that are compiled to machine code."""
 
+import threading
+import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
 from numba import njit
+from numba.core import event
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -34,6 +38,45 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
     no_wrappers: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return njit(nogil=True, error_model="numpy", **no_wrappers, **options)
+
+
+@contextmanager
+def stopwatch() -> Iterator[Callable[[], float]]:
+    """Measure a block; the function that it yields returns the seconds so far.
+
+    The time in which this thread compiles kernels, or reads them from the cache, does not count.
+    """
+    compiler = _CompilerTime()
+    started = time.perf_counter()
+    with event.install_listener("numba:compiler_lock", compiler):
+        yield lambda: time.perf_counter() - started - compiler.seconds
+
+
+class _CompilerTime(event.Listener):
+    """Adds up the seconds in which the thread that made it holds numba's compiler, or waits for it.
+
+    Numba's lock is re-entered for each kernel that a kernel calls; only the outermost entry counts.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._thread = threading.get_ident()
+        self._depth = 0
+        self._entered = 0.0
+
+    def on_start(self, event: event.Event) -> None:
+        if threading.get_ident() != self._thread:
+            return
+        if self._depth == 0:
+            self._entered = time.perf_counter()
+        self._depth += 1
+
+    def on_end(self, event: event.Event) -> None:
+        if threading.get_ident() != self._thread:
+            return
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.perf_counter() - self._entered
 
 
 @cache

@@ -36,7 +36,7 @@ class Plan(Summary):
         limit: Upper limit on the value of any admissible path. The limit equals `value` if `exact`
             is True, and is NaN if the path was given.
         revisits: Number of bounds that enter a cell that the path has already visited.
-        seconds: Duration of the search in seconds.
+        seconds: Duration of the search in seconds, without the compilation of kernels.
         workspace: Workspace of the path.
         risk: Failure probability of each bound, and arrival probability with its 90 % band; None if
             the planner has no risk.

@@ -1,6 +1,5 @@
 """The planner, which searches for paths from a start to a goal in a workspace."""
 
-import time
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
@@ -26,6 +25,7 @@ from trustbo.hazard.risk import Risk, read_risk
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
 from trustbo.models.params import ParameterDraws
+from trustbo.kernels import stopwatch
 from trustbo.parallel import computing
 from trustbo.planning.draws import DrawnPaths, choose_draws
 from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped
@@ -273,14 +273,15 @@ class Planner(Summary):
                 workspace, or if beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
-        started = time.perf_counter()
-        mean, draws = mean_and_draws_of(params, self.workspace)
-        score, limits, paths = self.problem.best(self.problem.recursion(mean, x0))
+        with stopwatch() as elapsed:
+            mean, draws = mean_and_draws_of(params, self.workspace)
+            score, limits, paths = self.problem.best(self.problem.recursion(mean, x0))
+            plan = self._evaluated(self.problem.paths.cells(paths[0]), mean, draws, x0)
+            seconds = elapsed()
 
-        plan = self._evaluated(self.problem.paths.cells(paths[0]), mean, draws, x0)
         exact = bool(limits[0] - score[0] <= EXACT)
         limit = plan.value if exact else float(self.problem.objective.value(limits[0]))
-        return replace(plan, exact=exact, limit=limit, seconds=time.perf_counter() - started)
+        return replace(plan, exact=exact, limit=limit, seconds=seconds)
 
     def best_path(self, recursion: Recursion) -> tuple[Cell, ...]:
         """Find the best admissible path for a given recursion, such as one with optimistic drifts.
