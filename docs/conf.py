@@ -14,6 +14,9 @@ sys.path.insert(0, str(HERE / "extensions"))
 
 from api_pages import contents  # noqa: E402
 
+RETURNED = ("trustbo.Plan", "trustbo.Result", "trustbo.hazard.BoundRisk")
+"""Classes whose objects are returned by functions; how to construct them is not documented."""
+
 project = "trustbo"
 author = "The trustbo developers"
 project_copyright = f"2026, {author}"
@@ -49,7 +52,7 @@ napoleon_use_rtype = False
 default_role = "code"  # docstrings quote names in single backticks
 autosummary_imported_members = True
 autosummary_ignore_module_all = False
-autosummary_context = {"contents": contents()}
+autosummary_context = {"contents": contents(), "returned": RETURNED}
 autosummary_filename_map = {  # some file systems do not distinguish it from trustbo.workspace
     "trustbo.Workspace": "trustbo.Workspace-class",
 }
@@ -121,11 +124,25 @@ def shorten_signature(
     signature: str | None,
     result: str,
 ) -> tuple[str | None, str]:
-    """Write JAX's type of arrays by its name, and hide factories, which Sphinx cannot parse."""
+    """Write JAX's type of arrays by its name, and hide factories, which Sphinx cannot parse.
+
+    The classes in `RETURNED` are shown without a signature.
+    """
+    if name in RETURNED:
+        return "", result
     if signature is not None:
         signature = signature.replace(_ARRAY_LIKE, "~jax.typing.ArrayLike")
         signature = signature.replace("<factory>", "...")
     return signature, result
+
+
+def skip_parts_of_models(
+    app: Sphinx, kind: str, name: str, value: object, skip: bool, options: Any
+) -> bool | None:
+    """Leave out the members by which models implement `TrustModel`, which is not public."""
+    if (value.__doc__ or "").startswith("See `TrustModel."):
+        return True
+    return None  # as usual
 
 
 def setup(app: Sphinx) -> None:
@@ -135,3 +152,4 @@ def setup(app: Sphinx) -> None:
     app.connect("source-read", point_to_copies)
     app.connect("autodoc-process-docstring", drop_words_of_python)
     app.connect("autodoc-process-signature", shorten_signature)
+    app.connect("autodoc-skip-member", skip_parts_of_models)

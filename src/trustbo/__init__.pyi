@@ -20,6 +20,7 @@ from .campaign import iterate as iterate
 from .campaign import load_result as load_result
 from .campaign import resume as resume
 from .criticism import check as check
+from .data import Bound as Bound
 from .data import Mission as Mission
 from .errors import PosteriorError as PosteriorError
 from .errors import TrustboError as TrustboError

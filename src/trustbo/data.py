@@ -50,6 +50,12 @@ class Bound:
         TrustboError: The arrays disagree on the number of robots, a value is outside [0, 1], a
             duration is not positive, n_ticks is not a positive whole number, a rate is not a
             multiple of 1 / n_ticks, or the status is unknown.
+
+    Example:
+        >>> bound = mission.bounds[0]
+        >>> bound.cell == mission.path[1], bound.status
+        (True, 'ok')
+        >>> bound.contact_rate, bound.t1 - bound.t0  # of each robot; in seconds
     """
 
     cell: Cell

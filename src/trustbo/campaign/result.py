@@ -62,6 +62,8 @@ _FIRST_COLUMNS = (
 class Result(Summary):
     """Result of the missions of a campaign; properties are computed on first access.
 
+    Results are returned by `iterate`, `resume` and `load_result`.
+
     Attributes:
         workspace: Workspace of the campaign.
         state: Missions with their plans and posteriors, failures, and settings.
