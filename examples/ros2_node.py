@@ -9,7 +9,11 @@ The node subscribes to these topics, which `trustbo.logs.read_bag` can also read
 
     /<robot>/contact  std_msgs/Bool    whether the robot has contact with the lead, at each tick
     /mission/bound    std_msgs/String  {"bound": 2, "cell": [8, 1]} when bound 2 begins
-    /mission/status   std_msgs/String  ok, stuck, ... when a bound ends
+    /mission/status   std_msgs/String  ok, stuck, ... when a bound ends; aborted, also between
+                                       bounds, ends the mission
+
+If a bound fails and the lead can still move, the node plans the rest of the mission again. The new
+path first leads back to the previous cell; the way back is a bound with its own messages.
 
 After each of these messages, the node publishes:
 
@@ -22,6 +26,9 @@ import json
 import numpy as np
 
 import trustbo as tb
+
+REPLANNED = set(tb.hazard.CAUSES) - {"tipped"}
+"""Statuses after which the rest of the mission is planned again; a lead that tipped cannot move."""
 
 
 def take(follower, robots, topic, data, t):
@@ -36,12 +43,25 @@ def take(follower, robots, topic, data, t):
             follower.end(t)
         if marker["bound"] > 0:  # bound 0 is the start
             follower.begin(t, marker.get("cell"))
+    elif topic == "status" and data == "aborted" and not follower.running:
+        return True
     elif topic == "status":
         follower.end(t, data)
+        if data in REPLANNED:
+            return not replan(follower)
         return data != "ok" or len(follower.rest) == 1
     elif follower.running:
         follower.tick(t, np.where(np.array(robots) == topic, float(data), np.nan))
     return False
+
+
+def replan(follower):
+    """Plan the rest of the mission again, and return whether the goal can still be reached."""
+    try:
+        follower.replan()
+    except tb.NoPathError:
+        return False
+    return True
 
 
 def main():

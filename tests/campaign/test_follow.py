@@ -270,7 +270,56 @@ def test_the_example_of_a_ros_node_makes_the_mission_of_its_messages():
     found, expected = follower.to_mission(), whole(path, seen)
     for name in ("contact_rate", "n_ticks", "duration"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    follower = tb.Follower(campaign)
+
+
+def test_the_example_of_a_ros_node_replans_after_a_bound_that_failed():
+    take, campaign = example("ros2_node").take, begun(n_missions=0)
+    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    start, blocked, *_ = planned = follower.path
+    take(follower, robots, "bound", '{"bound": 1}', 0.0)
+    assert not take(follower, robots, "status", "stuck", 5.0)
+    assert follower.path[:3] == (start, blocked, start)
+    assert follower.path[3] != blocked
+    assert follower.path[-1] == planned[-1]
+    assert campaign.ask().path == follower.path
+
+    t = 5.0
+    for k in range(2, len(follower.path)):
+        marker = {"bound": k, "cell": follower.path[k]}
+        take(follower, robots, "bound", json.dumps(marker), t)
+        over = take(follower, robots, "status", "ok", t := t + 5.0)
+    assert over
+    mission = follower.to_mission()
+    assert (mission.bounds[0].status, mission.status) == ("stuck", "ok")
+
+
+@pytest.mark.parametrize("status", ["tipped", "aborted"])
+def test_the_example_of_a_ros_node_ends_a_mission_that_cannot_go_on(status):
+    take, campaign = example("ros2_node").take, begun(n_missions=0)
+    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    path = follower.path
+    take(follower, robots, "bound", '{"bound": 1}', 0.0)
+    assert take(follower, robots, "status", status, 5.0)
+    assert follower.path == path
+    assert follower.to_mission().status == status
+
+
+def test_the_example_of_a_ros_node_is_told_between_bounds_that_the_mission_ends():
+    take, campaign = example("ros2_node").take, begun(n_missions=0)
+    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    take(follower, robots, "bound", '{"bound": 1}', 0.0)
+    assert not take(follower, robots, "status", "stuck", 5.0)
+    assert take(follower, robots, "status", "aborted", 6.0)
+    assert follower.to_mission().status == "stuck"
+
+
+def test_the_example_of_a_ros_node_ends_a_mission_whose_goal_cannot_be_reached(monkeypatch):
+    def unreachable(self, *args, **options):
+        raise tb.NoPathError("no path")
+
+    take, campaign = example("ros2_node").take, begun(n_missions=0)
+    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    monkeypatch.setattr(tb.Follower, "replan", unreachable)
     take(follower, robots, "bound", '{"bound": 1}', 0.0)
     assert take(follower, robots, "status", "stuck", 5.0)
 
