@@ -33,7 +33,7 @@ from trustbo.inference.importance import (
 from trustbo.inference.place_maps import place_group
 from trustbo.inference.tree import N_PRIOR, in_label_order, to_datatree, with_latent
 from trustbo.inference.variables import draws_of, prior_parameters, to_variables
-from trustbo.models.backend import VERSIONS
+from trustbo.models.backend import library_attrs
 from trustbo.models.default import default_model
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
@@ -276,6 +276,7 @@ def _fit_model(
     if "proposal" in summary:
         tree["sample_stats"].attrs["proposal"] = summary.pop("proposal")
     tree.attrs |= _record(model, density) | summary | {"sampler": sampler, "seed": seed}
+    tree.attrs |= library_attrs(sampler)
 
     def add_latent(posterior: xr.DataTree) -> xr.DataTree:
         as_read = draws_of(density, variables)  # equal to what `add_latent` reads from a file
@@ -431,5 +432,4 @@ def _record(model: TrustModel, density: Density) -> dict[str, Any]:
         **model.x0,
         "resolution": observations.resolution if model.likelihood.adds_noise else 0.0,
         **{f"prior_{name}": text for name, text in model.priors.describe().items()},
-        **{f"{name}_version": version for name, version in VERSIONS.items()},
     }

@@ -36,7 +36,7 @@ from trustbo.inference.functions.nuts import (
 )
 from trustbo.inference.functions.sites import Site
 from trustbo.inference.tree import N_PRIOR, kept_draws, to_datatree
-from trustbo.models.backend import VERSIONS, own_settings
+from trustbo.models.backend import library_attrs, own_settings
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
 from trustbo.stacking import require_same_robots
@@ -139,7 +139,7 @@ def fit_function(
         "step_size": samples.step_size,
         **verdict.diagnostics,
         "not_identified": verdict.not_identified,
-        **{f"{name}_version": version for name, version in VERSIONS.items()},
+        **library_attrs("nuts"),
     }
 
     if not verdict.complaints:
