@@ -14,7 +14,7 @@ sys.path.insert(0, str(HERE / "extensions"))
 
 from api_pages import contents  # noqa: E402
 
-RETURNED = ("trustbo.Plan", "trustbo.Result", "trustbo.hazard.BoundRisk")
+RETURNED = ("trustbo.Plan", "trustbo.Result")
 """Classes whose objects are returned by functions; how to construct them is not documented."""
 
 project = "trustbo"

@@ -12,6 +12,7 @@ import pandas as pd
 from arviz_stats.summary import summary
 
 from trustbo import plots
+from trustbo.campaign.replan import is_replanned
 from trustbo.campaign.result import Result
 from trustbo.campaign.state import GIVEN_UP, incomplete_bounds
 from trustbo.data import Cell
@@ -20,6 +21,7 @@ from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
 from trustbo.plots.style import drawing
+from trustbo.team import Team
 
 __all__ = ["write_report"]
 __dir__ = __all__.copy  # tab completion lists only public names
@@ -256,14 +258,32 @@ def failed_bounds_of(result: Result) -> list[str]:
     return words
 
 
+def replanned_of(result: Result) -> list[str]:
+    """Return "replanned" or "" for each row of `Result.table`."""
+    entries = iter(result.state.entries)
+    words = []
+    for state in result.table()["state"]:
+        if state == GIVEN_UP:  # no plan was stored
+            words.append("")
+            continue
+        words.append("replanned" if is_replanned(next(entries).plan) else "")
+    return words
+
+
 def _missions(result: Result) -> _Section:
     table = result.table()
     failed = failed_bounds_of(result)
     if any(failed):
         table["failed_bounds"] = failed
+
+    replanned = replanned_of(result)
+    if any(replanned):
+        table["plan"] = replanned
+
     columns = (
         "status",
         "failed_bounds",
+        "plan",
         "contact_rate",
         "contact_lost",
         "objective",
@@ -276,15 +296,27 @@ def _missions(result: Result) -> _Section:
         shown = shown.rename(columns={"objective": "predicted_lost"})
         about = "Contact lost is in bounds; predictions include the costs of failures."
     shown.columns = [str(name).replace("_", " ") for name in shown.columns]
+
+    about += " The value predicted for the plan of a mission is based on all earlier missions."
+    if any(replanned):
+        about += f" {_about_replanned(result)}"
     return _Section(
         "Contact in each mission",
         [
             _table(shown),
-            _note(
-                f"{about} The value predicted for the plan of a mission is based on all earlier "
-                "missions. Printed pages have the last 12 missions."
-            ),
+            _note(f"{about} Printed pages have the last 12 missions."),
         ],
+    )
+
+
+def _about_replanned(result: Result) -> str:
+    """Return what the predicted value of a mission means that was replanned."""
+    covers = "refers to the rest of the path"
+    if result.planner.problem.objective.of_contact:
+        covers = "includes the contact already lost"
+    return (
+        "In replanned missions, it is the value of the last plan, which is also based on the "
+        f"bounds driven before, and {covers}."
     )
 
 
@@ -315,6 +347,7 @@ def _diagnostics(result: Result) -> _Section:
 def _settings(result: Result) -> _Section:
     texts = {name: str(value) for name, value in result.settings.items()}
     short = {name: text for name, text in texts.items() if len(text) < 120}
+    short |= _about_team(result.workspace.team)
     return _Section(
         "Settings",
         [
@@ -322,6 +355,22 @@ def _settings(result: Result) -> _Section:
         ],
         on_screen=True,
     )
+
+
+def _about_team(team: Team) -> dict[str, str]:
+    """Return the names, slope limits and lidar ranges of the robots, as texts."""
+    members = {"lead": team.lead} | dict(zip(team.names, team.robots, strict=True))
+    limits = {name: np.rad2deg(robot.max_slope) for name, robot in members.items()}
+    ranges = {name: robot.lidar_range for name, robot in members.items()}
+
+    def listed(values: dict[str, float]) -> str:
+        return ", ".join(f"{name} {value:.3g}" for name, value in values.items())
+
+    return {
+        "robots": ", ".join(members),
+        "slope limits (degrees)": listed(limits),
+        "lidar ranges (m)": listed(ranges),
+    }
 
 
 def _name(cell: Cell) -> str:

@@ -224,6 +224,38 @@ def test_the_report_shows_failed_bounds_and_the_measured_contact_of_the_weakest(
     assert "not driven yet" in facts_of(other)["Weakest bound"]
 
 
+def test_the_report_has_the_limits_of_all_robots_and_marks_replanned_missions(tmp_path):
+    slow = tb.Robot(max_slope=np.radians(20.0), lidar_range=40.0)
+    team = tb.Team(robots=(slow, tb.Robot()), names=("spot", "husky"))
+    awareness = np.random.default_rng(0).uniform(size=(2, 3, 3, 2))
+    workspace = tb.Workspace.from_awareness(awareness, team=team)
+    campaign = tb.Campaign(workspace, (2, 0), (0, 2), fit={"draws": 100}, progress=False)
+
+    def drive(*, replan):
+        follower = tb.Follower(campaign)
+        t = 0.0
+        while len(follower.rest) > 1:
+            follower.begin(t)
+            follower.tick(t + 1.0, [True, False])
+            fails = replan and not follower.bounds
+            follower.end(t := t + 2.0, "stuck" if fails else "ok")
+            if fails:
+                follower.replan()
+        campaign.tell(follower.to_mission())
+        write_report(tmp_path / "report.html", campaign)
+        return (tmp_path / "report.html").read_text(encoding="utf-8")
+
+    html = drive(replan=False)
+    assert "<td>lead, spot, husky</td>" in html
+    assert "<td>lead 45, spot 20, husky 45</td>" in html
+    assert "<td>lead 100, spot 40, husky 100</td>" in html
+    assert "replanned" not in html
+
+    html = drive(replan=True)
+    assert html.count("<td>replanned</td>") == 1
+    assert "In replanned missions" in html
+
+
 @pytest.mark.parametrize(("bounds", "n"), [([], 1), ([2], 2)])
 def test_the_map_of_the_path_alone_shows_all_posts(result, bounds, n):
     axes = plots.plan_map(result.plan, bounds=bounds)

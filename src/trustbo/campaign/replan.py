@@ -177,3 +177,12 @@ def _contact_lost(problem: Problem, driven: Driven) -> float:
     expected = problem.likelihood.mean_rate(driven.trust, noise_sd)
     rates = np.where(np.isnan(driven.contact_rate), expected, driven.contact_rate)
     return float((1.0 - rates).mean(1).sum())
+
+
+def is_replanned(plan: Plan) -> bool:
+    """Return whether bounds had been driven, or were blocked, when a campaign made this plan.
+
+    Only bounds that were driven have the failure probability 0; see `whole_plan`.
+    """
+    was_driven = plan.p_fail is not None and plan.p_fail[0] == 0.0
+    return was_driven or bool(plan.blocked)
