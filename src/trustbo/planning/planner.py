@@ -22,10 +22,10 @@ from trustbo.errors import (
 )
 from trustbo.hazard.components import Components
 from trustbo.hazard.risk import Risk, read_risk
+from trustbo.kernels import stopwatch
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
 from trustbo.models.params import ParameterDraws
-from trustbo.kernels import stopwatch
 from trustbo.parallel import computing
 from trustbo.planning.draws import DrawnPaths, choose_draws
 from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped
