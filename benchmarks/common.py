@@ -2,7 +2,9 @@
 
 import argparse
 import csv
+import io
 import os
+import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -51,8 +53,13 @@ def arguments(
 
 
 def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """Parse the arguments of this process; check the selected names, and make --data a path."""
+    """Parse the arguments of this process; check the selected names, and make --data a path.
+
+    From now on, the script ends without a traceback if nothing reads its output any more.
+    """
     given = parser.parse_args()
+    _end_quietly_without_reader()
+
     if choices := getattr(given, "choices", None):
         for name in given.names:
             if name not in choices:
@@ -61,6 +68,23 @@ def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
     if getattr(given, "data", None) is not None:
         given.data = Path(given.data)
     return given
+
+
+def _end_quietly_without_reader() -> None:
+    """End this process with one line if a pipe is broken, as in `python groups.py | head`."""
+
+    def on_error(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+        if not issubclass(kind, BrokenPipeError):
+            sys.__excepthook__(kind, error, trace)
+            return
+
+        # Python writes the rest of its buffer when it exits; see the documentation of `signal`.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        print(f"stopped: {error}", file=sys.stderr)
+
+    sys.excepthook = on_error
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)  # so that it is `print` that fails
 
 
 # --- timer ---

@@ -19,7 +19,8 @@ from scipy import stats
 from trustbo.study import worlds
 from trustbo.study.summary import bootstrap
 
-OURS, BASELINES = "trustbo", ("running mean", "residual process", "line of sight")
+OURS = "trustbo"
+BASELINES = ("running mean", "residual process", "line of sight")
 KINDS = ("right", "wall", "bare", "slopes", "aged", "canopy", "shapes", "teams",
          "robots", "days", "foul", "change", "jammer", "physics", "limit")  # fmt: skip
 ALIKE = {
@@ -42,8 +43,6 @@ COLUMNS = ["lost_while_learning", "regret_now", "arrive", LOST, "arrive_first_3"
 STORED = Path(__file__).parent / "reference" / "worlds_0.5.csv"
 BEFORE = Path(__file__).parent / "reference" / "worlds_0.4.csv"
 """Rows of version 0.4, on the worlds that it knew."""
-
-
 NAMES = {
     "case": "method", "lost while learning": "lost_while_learning", "regret now": "regret_now",
     "lost with failures": LOST, "arrive of the first 3": "arrive_first_3",
@@ -79,14 +78,17 @@ def clustered(values: np.ndarray, clusters: np.ndarray) -> tuple[float, float, f
     clusters, and t has G - 1 degrees of freedom (Liang & Zeger 1986). If each cluster has one
     value, this is the t test. With one cluster, the interval and the p-value are NaN.
     """
-    mean, (_, index) = float(np.mean(values)), np.unique(clusters, return_inverse=True)
+    mean = float(np.mean(values))
+    _, index = np.unique(clusters, return_inverse=True)
     n_clusters = index.max() + 1
     if n_clusters < 2:
         return mean, np.nan, np.nan, np.nan
+
     sums = np.bincount(index, values - mean)
     se = float(np.sqrt(n_clusters / (n_clusters - 1.0) * (sums**2).sum())) / len(values)
     if se == 0.0:
         return mean, mean, mean, float(mean == 0.0)
+
     half = float(stats.t.ppf(0.975, n_clusters - 1)) * se
     p = 2.0 * float(stats.t.sf(abs(mean) / se, n_clusters - 1))
     return mean, mean - half, mean + half, p
@@ -95,11 +97,19 @@ def clustered(values: np.ndarray, clusters: np.ndarray) -> tuple[float, float, f
 def holm(p_values: Sequence[float]) -> np.ndarray:
     """Correct p-values for multiple tests by Holm's method; NaN values are not counted as tests."""
     p = np.array(p_values, dtype=float)
-    corrected, tests = np.full(len(p), np.nan), np.flatnonzero(np.isfinite(p))
+    tests = np.flatnonzero(np.isfinite(p))
     order = tests[np.argsort(p[tests], kind="stable")]
+
     factors = np.arange(len(order), 0, -1)
+    corrected = np.full(len(p), np.nan)
     corrected[order] = np.minimum(1.0, np.maximum.accumulate(factors * p[order]))
     return corrected
+
+
+def methods_in(rows: pd.DataFrame) -> list[str]:
+    """Return the methods that are compared: trustbo and the baselines in a table."""
+    known = set(rows["method"])
+    return [OURS, *(name for name in BASELINES if name in known)]
 
 
 def by_group(rows: pd.DataFrame) -> pd.DataFrame:
@@ -111,24 +121,29 @@ def by_group(rows: pd.DataFrame) -> pd.DataFrame:
     Returns:
         Table with columns group, n (worlds), what, `value`, `low` and `high`.
     """
-    methods = [OURS, *(name for name in BASELINES if name in set(rows["method"]))]
-    wide, table = paired(rows, methods), []
+    methods = methods_in(rows)
+    baselines = methods[1:]
+    wide = paired(rows, methods)
+
+    table = []
     for group, kinds in GROUPS.items():
         some = wide[wide.index.get_level_values("kind").isin(kinds)]
         if some.empty:
             continue
-        names = some.index.get_level_values("world")
+
         numbers = {name: some[name].to_numpy() for name in methods}
-        best = some[methods[1:]].mean().idxmin() if len(methods) > 1 else None
-        numbers |= {f"{OURS} minus {name}": numbers[OURS] - numbers[name] for name in methods[1:]}
-        if best is not None:
+        for name in baselines:
+            numbers[f"{OURS} minus {name}"] = numbers[OURS] - numbers[name]
+        if baselines:
+            best = some[baselines].mean().idxmin()
             numbers[f"{OURS} minus the best ({best})"] = numbers[OURS] - numbers[best]
-        grounds = grounds_of(names)
-        found = bootstrap(numbers, grounds, np.mean)
+
+        names = some.index.get_level_values("world")
+        found = bootstrap(numbers, grounds_of(names), np.mean)
         for name in numbers:
-            value, *ends = (found[name, what] for what in ("value", "low", "high"))
-            ends = ends if len(set(grounds)) > 1 else [np.nan, np.nan]  # no interval
-            table.append([group, names.nunique(), name, value, *ends])
+            value_and_ends = [found[name, what] for what in ("value", "low", "high")]
+            table.append([group, names.nunique(), name, *value_and_ends])
+
     return pd.DataFrame(table, columns=["group", "n", "what", "value", "low", "high"])
 
 
@@ -138,17 +153,23 @@ def by_kind(rows: pd.DataFrame) -> pd.DataFrame:
     Intervals and p-values are from a t test with errors clustered by terrain. `p_holm` is corrected
     for the number of kinds.
     """
-    methods = [OURS, *(name for name in BASELINES if name in set(rows["method"]))]
-    wide, table = paired(rows, methods), []
+    methods = methods_in(rows)
+    baselines = methods[1:]
+    wide = paired(rows, methods)
+
+    table = []
     for kind in KINDS:
         some = wide[wide.index.get_level_values("kind") == kind]
-        if some.empty or len(methods) < 2:
+        if some.empty or not baselines:
             continue
-        names = some.index.get_level_values("world")
-        best = some[methods[1:]].mean().idxmin()
+
+        best = some[baselines].mean().idxmin()
         less = (some[OURS] - some[best]).to_numpy()
+
+        names = some.index.get_level_values("world")
         found = clustered(less, grounds_of(names))
         table.append([kind, names.nunique(), *some[methods].mean(), best, *found])
+
     head = ["kind", "n", *methods, "best", "value", "low", "high", "p"]
     found = pd.DataFrame(table, columns=head)
     return found.assign(p_holm=holm(found["p"]))
@@ -170,17 +191,22 @@ def beside(rows: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
     """Compute the contact lost now minus that of version 0.4, on the same worlds and courses."""
     ours = [table[table["method"] == OURS] for table in (rows, reference)]
     both = ours[0].merge(ours[1], on=["world", "kind", "course"], suffixes=("", "_0.4"))
+    groups = GROUPS | {kind: (kind,) for kind in KINDS}
+
     table = []
-    for name, kinds in (GROUPS | {kind: (kind,) for kind in KINDS}).items():
+    for name, kinds in groups.items():
         some = both[both["kind"].isin(kinds)]
         if some.empty:
             continue
+
         less = (some[LOST] - some[f"{LOST}_0.4"]).to_numpy()
         found = clustered(less, grounds_of(some["world"]))
+
         means = some[f"{LOST}_0.4"].mean(), some[LOST].mean()
         regret = some["regret_now_0.4"].mean(), some["regret_now"].mean()
         arrive = some["arrive_0.4"].mean(), some["arrive"].mean()
         table.append([name, some["world"].nunique(), *means, *found, *regret, *arrive])
+
     head = ["what", "n", "0.4", "now", "value", "low", "high", "p"]
     head += ["regret_0.4", "regret", "arrive_0.4", "arrive"]
     return pd.DataFrame(table, columns=head)
@@ -188,48 +214,72 @@ def beside(rows: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
 
 def report_groups(rows: pd.DataFrame) -> None:
     """Print Markdown tables by group and kind, of arrivals, and compared with version 0.4."""
+    print_groups(by_group(rows))
+    print_kinds(by_kind(rows))
+    print_arrivals(arrivals(rows), methods_in(rows))
+
+    limits = by_limit(rows)
+    if not limits.empty:
+        print_limits(limits, methods_in(rows))
+
+    compared = beside(rows, pd.read_csv(BEFORE))
+    if not compared.empty:
+        print_compared(compared)
+
+
+def print_groups(groups: pd.DataFrame) -> None:
+    """Print the table of `by_group`."""
     print("\n**Lost while learning, with failures**: bounds per mission, by group\n")
-    groups = by_group(rows)
     table = Table("group (worlds)", "method", "lost [95 % by terrain]")
     for row in groups.itertuples():
         table.row(f"{row.group} ({row.n})", row.what, interval(row, 3))
+
+
+def print_kinds(kinds: pd.DataFrame) -> None:
+    """Print the table of `by_kind`."""
     print(f"\n**{OURS} minus the best baseline of each kind**\n")
-    kinds = by_kind(rows)
     methods = [name for name in (OURS, *BASELINES) if name in kinds]
     table = Table("kind (worlds)", *methods, "best", "difference [95 %]", "p", "p, Holm")
     for _, row in kinds.iterrows():
         means = [f"{row[name]:.3f}" for name in methods]
         p_values = [f"{row[name]:.3g}" for name in ("p", "p_holm")]
         table.row(f"{row['kind']} ({row['n']})", *means, row["best"], interval(row, 3), *p_values)
-    print("\n**Missions that arrive**: fraction of all missions\n")
-    home = arrivals(rows)
-    methods = [name for name in (OURS, *BASELINES) if name in set(rows["method"])]
-    table = Table("kind", *methods)
-    for kind in (k for k in KINDS if k in home.index.levels[0]):
-        table.row(kind, *(f"{home.loc[(kind, name), 'arrive']:.3f}" for name in methods))
-    if "limit" in home.index.levels[0]:
-        for part, column in (
-            ("first three", "arrive_first_3"),
-            ("from the fourth on", "arrive_later"),
-        ):
-            cells = [f"{home.loc[('limit', name), column]:.3f}" for name in methods]
-            table.row(f"limit, {part}", *cells)
-    limits = by_limit(rows)
-    if not limits.empty:
-        print("\n**Wrong slope limits**: lost, and fraction of missions that arrive\n")
-        table = Table("limit", *(f"{name}: lost, arrive" for name in methods))
-        for case in limits.index.levels[0]:
-            found = [limits.loc[(case, name)] for name in methods]
-            table.row(case, *(f"{one[LOST]:.3f}, {one['arrive']:.3f}" for one in found))
 
-    if (compared := beside(rows, pd.read_csv(BEFORE))).empty:
+
+def print_arrivals(home: pd.DataFrame, methods: Sequence[str]) -> None:
+    """Print the table of `arrivals`; for wrong slope limits, also of early and later missions."""
+    print("\n**Missions that arrive**: fraction of all missions\n")
+    table = Table("kind", *methods)
+    present = [kind for kind in KINDS if kind in home.index.levels[0]]
+    for kind in present:
+        table.row(kind, *(f"{home.loc[(kind, name), 'arrive']:.3f}" for name in methods))
+
+    if "limit" not in present:
         return
+    parts = {"first three": "arrive_first_3", "from the fourth on": "arrive_later"}
+    for part, column in parts.items():
+        cells = [f"{home.loc[('limit', name), column]:.3f}" for name in methods]
+        table.row(f"limit, {part}", *cells)
+
+
+def print_limits(limits: pd.DataFrame, methods: Sequence[str]) -> None:
+    """Print the table of `by_limit`."""
+    print("\n**Wrong slope limits**: lost, and fraction of missions that arrive\n")
+    table = Table("limit", *(f"{name}: lost, arrive" for name in methods))
+    for case in limits.index.levels[0]:
+        found = [limits.loc[(case, name)] for name in methods]
+        table.row(case, *(f"{one[LOST]:.3f}, {one['arrive']:.3f}" for one in found))
+
+
+def print_compared(compared: pd.DataFrame) -> None:
+    """Print the table of `beside`."""
     print(f"\n**{OURS} compared with version 0.4**: lost on the same worlds and courses\n")
-    pairs = ("0.4", "now"), ("regret_0.4", "regret"), ("arrive_0.4", "arrive")
     table = Table(
         "worlds", "0.4", "now", "difference [95 %]", "p", "final regret (%), 0.4", "now",
         "arrive, 0.4", "now",
     )  # fmt: skip
+
+    pairs = ("0.4", "now"), ("regret_0.4", "regret"), ("arrive_0.4", "arrive")
     for _, row in compared.iterrows():
         means, regret, arrive = ([f"{row[name]:.3f}" for name in pair] for pair in pairs)
         what = f"{row['what']} ({row['n']})"
@@ -237,13 +287,19 @@ def report_groups(rows: pd.DataFrame) -> None:
 
 
 def interval(row: object, places: int) -> str:
-    """Format a value with its interval, or with "-" if worlds on one terrain give none."""
+    """Format a value with its interval; "-" stands for what does not exist.
+
+    Worlds on one terrain give no interval.
+    """
     value, low, high = (
         row[name] if isinstance(row, pd.Series) else getattr(row, name)
         for name in ("value", "low", "high")
     )
+    if np.isnan(value):
+        return "-"
     if np.isnan(low):
         return f"{value:z.{places}f} [-]"
+
     return f"{value:z.{places}f} [{low:z.{places}f}, {high:z.{places}f}]"
 
 
@@ -254,4 +310,5 @@ if __name__ == "__main__":
     given = parsed(parser)
     if not given.file.exists():
         parser.error(f"there is no file {given.file}")
+
     report_groups(pd.read_csv(given.file))

@@ -21,7 +21,7 @@ import numpy as np
 import pandas as pd
 from baselines import line_of_sight, oracle, residual_process, running_mean, unlearned
 from common import arguments, parsed
-from groups import KINDS, OURS, report_groups, rows_of
+from groups import KINDS, OURS, interval, report_groups, rows_of
 from joblib import Parallel, delayed
 
 import trustbo as tb
@@ -68,6 +68,14 @@ COLUMNS = ["regret after 0", "regret after 3", "regret after 8", "regret after 1
            "seconds"]  # fmt: skip
 OF_CASES = ["regret after 3", "regret after 8", "regret after 15", "regret now",
             "lost while learning", "lost with failures"]  # fmt: skip
+ABOUT = {
+    "seconds": "seconds (CPU time per mission)",
+    "arrive": "arrive (fraction of missions that reach the goal)",
+    "lost while learning": "lost while learning (bounds per mission)",
+    "lost with failures": "lost with failures (bounds per mission; failed bounds count as lost)",
+    "missions to 1 %": "missions to 1 % (missions until the regret stays within 1 %)",
+}
+"""Longer descriptions of quantities, keyed by the column names of `study.numbers_of`."""
 OF_DIFFERENCES = ["pairs", "regret after 15", "regret now", "lost while learning",
                   "lost with failures", "missions to 1 %", "seconds"]  # fmt: skip
 
@@ -154,7 +162,9 @@ def report(numbers: pd.DataFrame, csv: Path | None = None):
     for by in ((), ("kind",)):
         table = differences(numbers, OURS, by)
         print(f"\n{OURS} minus each other method, same world, course and seed\n")
-        print(f"{as_text(table, OF_DIFFERENCES)}\n\n" + "\n".join(worse_than(table)))
+        print(f"{as_text(table, OF_DIFFERENCES)}\n")
+        print(f"Where {OURS} is significantly worse, by the 95 % interval of the difference:\n")
+        print("\n".join(worse_than(table)))
     report_groups(rows_of(numbers))
 
 
@@ -171,8 +181,9 @@ def worse_than(table: pd.DataFrame) -> list[str]:
         worse = table[name, "high"] < 0.0 if good else table[name, "low"] > 0.0
         rows = [label(key) for key in table.index[worse.to_numpy()]]
         if rows:
-            lines.append(f"worse in {name} than: {'; '.join(rows)}")
-    return lines or ["worse than: none"]
+            what = ABOUT.get(name, name)
+            lines.append(f"- {what}: worse than {'; '.join(rows)}")
+    return lines or ["- nowhere"]
 
 
 def as_text(table: pd.DataFrame, columns: list[str]) -> str:
@@ -188,10 +199,7 @@ def as_text(table: pd.DataFrame, columns: list[str]) -> str:
                 cells.append(f"{row[name, 'value']:.0f}")
                 continue
             places = 1 if "regret" in name or "missions" in name else 2
-            value, low, high = (
-                f"{row[name, what]:z.{places}f}" for what in ("value", "low", "high")
-            )
-            cells.append(f"{value} [{low}, {high}]")
+            cells.append(interval(row[name], places))
         lines.append(" | ".join([label(key), *cells]))
     return "\n".join(f"| {line} |" for line in lines)
 

@@ -203,6 +203,16 @@ def test_help_is_printed_without_reading_a_table():
     assert "FILE" in found.stdout
 
 
+def test_the_script_ends_without_a_traceback_if_nothing_reads_its_output():
+    with subprocess.Popen(
+        [sys.executable, groups.__file__], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as script:
+        script.stdout.close()
+        complaint = script.stderr.read()
+    assert complaint.startswith("stopped: ")
+    assert len(complaint.splitlines()) == 1
+
+
 def test_worlds_are_of_their_terrains():
     by_name = worlds()
     assert grounds_of(by_name).tolist() == [world.ground for world in by_name.values()]

@@ -98,7 +98,8 @@ def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataF
         by: Columns by which the runs are grouped.
 
     Returns:
-        Table with two column levels: the quantity, and its `value`, `low` and `high`.
+        Table with two column levels: the quantity, and its `value`, `low` and `high`. The ends of
+        the interval are NaN if there is only one scene.
 
     Raises:
         TrustboError: A column is unknown.
@@ -153,8 +154,6 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
         scenes = runs["scene"].to_numpy()
 
         row = bootstrap(less, scenes, np.nanmean)
-        if len(set(scenes)) == 1:
-            row |= {(name, end): np.nan for name in names for end in ("low", "high")}
         label = key if by else key[0]  # pyright: ignore[reportIndexIssue]
         rows[label] = {("pairs", "value"): float(len(runs))} | row
     return _table(rows, [*by, f"{ours} less"])
@@ -167,7 +166,8 @@ def bootstrap(
 ) -> dict[tuple[str, str], float]:
     """Compute `middle` (by default, the mean or median as in `summary`) and its 95 % interval.
 
-    The runs of a cluster are resampled together, and all quantities use the same resamples.
+    The runs of a cluster are resampled together, and all quantities use the same resamples. With
+    one cluster, there is no interval: its ends are NaN.
     """
     rng = np.random.default_rng(0)
     names, index = np.unique(clusters, return_inverse=True)
@@ -185,7 +185,9 @@ def bootstrap(
             continue
 
         usual = middle or (np.nanmedian if " after " in name else np.nanmean)
-        low, high = np.quantile([usual(values[chosen]) for chosen in drawn], _ENDS)
+        low = high = np.nan
+        if len(members) > 1:
+            low, high = np.quantile([usual(values[chosen]) for chosen in drawn], _ENDS)
         row[name, "value"] = float(usual(values))
         row[name, "low"] = low
         row[name, "high"] = high
