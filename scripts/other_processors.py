@@ -24,7 +24,7 @@ from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 ROOT = Path(__file__).resolve().parents[1]
 PYTEST = [sys.executable, "-m", "pytest", "-q", "--numprocesses", "2", "--dist", "worksteal"]
 NOT_OPTIMISED = "--xla_backend_optimization_level=0"
-"""Flag that `make test` also sets, to compile faster."""
+"""Flag that makes XLA compile faster."""
 
 DISPATCHED = [name for name in __cpu_dispatch__ if __cpu_features__[name]]
 """Features of this processor that NumPy uses and that can be disabled."""
