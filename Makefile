@@ -22,8 +22,9 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: $(VENV)/.installed
 	$(BIN)/python scripts/demo.py --out out/demo
 
+# Most tests compile more than they compute, so a lower optimisation makes them faster.
 test: $(VENV)/.installed-dev
-	$(PYTEST) -m "not slow" tests
+	XLA_FLAGS=--xla_backend_optimization_level=1 $(PYTEST) -m "not slow" tests
 
 jupyter: $(VENV)/.installed-notebook
 	$(BIN)/jupyter lab notebooks
