@@ -194,20 +194,18 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     keep contact and never fail. The cost is computed jointly over components of the hazard
     posterior, because all bounds share the slope limit.
     """
-    is_likely = ~(risk.mean < _RECOVERED)
-    n_failures = risk.stopped + _ROUNDING
-    stopped = (n_failures >= _STOPPED) & is_likely
-
     if planner.problem.failure_cost is None and not risk.has_failures:
         planner = planner.with_failure_cost(0.0)
 
     problem = planner.problem
     priced = problem.objective.of_contact and problem.failure_cost != 0.0
+    is_likely = ~(risk.mean < _RECOVERED)
     if priced:
+        stopped = (risk.stopped + _ROUNDING >= _STOPPED) & is_likely
         avoided = stopped.any(-1) & (stopped | ~risk.exists).all(-1)
     else:
-        n_of_bounds = risk.stopped_with_any_next + _ROUNDING
-        avoided = (n_of_bounds >= _STOPPED) & (is_likely & risk.exists).any(-1)
+        stopped = risk.stopped_with_any_next + _ROUNDING >= _STOPPED
+        avoided = stopped & (is_likely & risk.exists).any(-1)
     if avoided.any():
         planner = planner.avoiding(avoided, np.nanmax(risk.mean, axis=-1, initial=0.0))
 

@@ -76,6 +76,7 @@ class BoundRisk(Summary):
 
         # A unit is a bound with one or more next moves; see `workspace.difficulty`.
         is_first = difficulty.unit == np.arange(shape[-1])
+        self._is_first = is_first
         number = np.full(shape, -1)
         number[is_first] = np.arange(is_first.sum())
         first = np.maximum(difficulty.unit, 0)
@@ -163,10 +164,7 @@ class BoundRisk(Summary):
     @cached_property
     def stopped_with_any_next(self) -> np.ndarray:
         """Posterior mean of the number of past failures of each bound, shape (move, row, col)."""
-        is_first = np.zeros(self._unit.shape, bool)
-        _, first = np.unique(self._unit[self.exists], return_index=True)
-        is_first[tuple(np.argwhere(self.exists)[first].T)] = True
-        return np.where(is_first, self.stopped, 0.0).sum(-1)
+        return np.where(self._is_first, self.stopped, 0.0).sum(-1)
 
     @cached_property
     def _expected_failures(self) -> np.ndarray:
