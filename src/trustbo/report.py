@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from arviz_stats.summary import summary
 from trustbo import plots
 from trustbo.campaign.replan import is_replanned
 from trustbo.campaign.result import Result
-from trustbo.campaign.state import GIVEN_UP, incomplete_bounds
+from trustbo.campaign.state import GIVEN_UP, Entry, incomplete_bounds
 from trustbo.data import Cell
 from trustbo.display import render
 from trustbo.errors import require_kind
@@ -247,27 +247,29 @@ def _maps(result: Result) -> _Section:
 
 def failed_bounds_of(result: Result) -> list[str]:
     """Return the bounds that were not completed in each row of `Result.table`, as text."""
-    missions = iter(result.missions)
     words = []
-    for row in result.table().to_dict("records"):
-        if row["state"] == GIVEN_UP:  # only the cell is known
+    for row, entry in _rows_and_entries(result):
+        if entry is None:  # only the cell is known
             words.append(f"into {row['where']} ({row['status']})" if row["where"] else "")
             continue
-        failed = incomplete_bounds(next(missions))
+        failed = incomplete_bounds(entry.mission)
         words.append(", ".join(f"{k} into {_name(cell)} ({why})" for k, cell, why in failed))
     return words
 
 
 def replanned_of(result: Result) -> list[str]:
     """Return "replanned" or "" for each row of `Result.table`."""
+    return [
+        "replanned" if entry is not None and is_replanned(entry.plan) else ""
+        for _, entry in _rows_and_entries(result)
+    ]
+
+
+def _rows_and_entries(result: Result) -> Iterator[tuple[dict[str, Any], Entry | None]]:
+    """Yield each row of `Result.table` with its mission; None for missions that were given up."""
     entries = iter(result.state.entries)
-    words = []
-    for state in result.table()["state"]:
-        if state == GIVEN_UP:  # no plan was stored
-            words.append("")
-            continue
-        words.append("replanned" if is_replanned(next(entries).plan) else "")
-    return words
+    for row in result.table().to_dict("records"):
+        yield row, None if row["state"] == GIVEN_UP else next(entries)
 
 
 def _missions(result: Result) -> _Section:
