@@ -50,16 +50,16 @@ SHARED = PooledTrust(effects=EFFECTS, shared_noise=True)
 CENSORED = PooledTrust(effects=EFFECTS, family="censored")
 
 FITS = {
-    "default model, 3 missions": (3, DEFAULT),
-    "default model, 15 missions": (15, DEFAULT),
-    "default model, 60 missions": (60, DEFAULT),
-    "default model, 200 missions": (200, DEFAULT),
-    "default model, 60 missions on 10 paths": (60, DEFAULT),
-    "default model, 200 missions on 10 paths": (200, DEFAULT),
-    "shared noise, 15 missions": (15, SHARED),
-    "censored rates, 15 missions": (15, CENSORED),
+    "default model, 3 missions": (3, DEFAULT, None),
+    "default model, 15 missions": (15, DEFAULT, None),
+    "default model, 60 missions": (60, DEFAULT, None),
+    "default model, 200 missions": (200, DEFAULT, None),
+    "default model, 60 missions on 10 paths": (60, DEFAULT, 10),
+    "default model, 200 missions on 10 paths": (200, DEFAULT, 10),
+    "shared noise, 15 missions": (15, SHARED, None),
+    "censored rates, 15 missions": (15, CENSORED, None),
 }
-"""Number of missions and model by name."""
+"""Number of missions, model, and number of paths (None if all differ), by name."""
 
 NAMES = ("beta0", "delta_w")
 """Parameters whose draws and means are compared in `paper`."""
@@ -112,8 +112,8 @@ def timed_fits(given):
 
 def one_case(table, name, n_seeds, later=False, label=""):
     """Add the row of a fit; if `later`, it starts from the posterior of one mission fewer."""
-    n, model = FITS[name]
-    data = missions(n, limit=model is CENSORED, n_paths=10 if "10 paths" in name else None)
+    n, model, n_paths = FITS[name]
+    data = missions(n, limit=model is CENSORED, n_paths=n_paths)
     options = {"latent": False, "check": False}
     if later:
         options["start"] = tb.fit(data[:-1], model, **options)
