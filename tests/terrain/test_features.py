@@ -225,3 +225,16 @@ def test_a_hole_in_the_surface_leaves_the_means_around_it():
     surface[5, 6] = np.nan
     holed = terrain.assign(dsm=terrain["dsm"].copy(data=surface))
     np.testing.assert_allclose(vegetation_density(holed), vegetation_density(terrain), rtol=1e-6)
+
+
+def test_missing_pixels_count_neither_as_covered_nor_as_clear():
+    rng = np.random.default_rng(0)
+    dem = np.where(rng.random((25, 30)) < 0.3, np.nan, 0.0)
+    height = rng.choice([0.0, 8.0], dem.shape)
+    cover = canopy_cover(terrain_of(dem, height))
+
+    padded = np.pad(np.where(np.isnan(dem), np.nan, height), 5, mode="edge")
+    for row, col in np.argwhere(np.isfinite(dem)).tolist():
+        square = padded[row : row + 11, col : col + 11]
+        known = square[np.isfinite(square)]
+        assert cover[row, col] == pytest.approx((known > 2.0).mean()), (row, col)

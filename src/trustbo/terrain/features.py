@@ -145,7 +145,9 @@ def canopy_height(terrain: xr.Dataset) -> np.ndarray:
 @feature("canopy_cover", sign=-1)
 def canopy_cover(terrain: xr.Dataset) -> np.ndarray:
     """Compute the fraction of a square of half-width 5 m covered by canopy over 2 m high."""
-    return _local_mean(terrain, (canopy_height(terrain) > _COVER).astype(float))
+    height = canopy_height(terrain)
+    covered = np.where(np.isfinite(height), height > _COVER, np.nan)
+    return _local_mean(terrain, covered)
 
 
 @feature("vegetation_density", sign=-1)
