@@ -30,6 +30,10 @@ _DRAWS = 50
 """Number of posterior draws for the uncertainty map."""
 _SHOWN = 3
 """Number of bounds shown in detail; these are the bounds with the least trust."""
+_NOT_PRINTED = "screen"
+"""Class of sections that are not printed."""
+_LAST_PRINTED = "missions"
+"""Class of sections of which only the last 12 rows are printed."""
 _ENDS = {"n_iterations": "all missions were run", "interrupted": "none; more missions can be run"}
 
 
@@ -43,11 +47,11 @@ class _Block(NamedTuple):
 
 
 class _Section(NamedTuple):
-    """Section of the page; `on_screen` sections are not printed."""
+    """Section of the page, with its class in the style sheet of the template."""
 
     heading: str
     blocks: list[_Block]
-    on_screen: bool = False
+    css_class: str = ""
 
 
 def write_report(path: FilePath, result: Result) -> None:
@@ -308,6 +312,7 @@ def _missions(result: Result) -> _Section:
             _table(shown),
             _note(f"{about} Printed pages have the last 12 missions."),
         ],
+        css_class=_LAST_PRINTED,
     )
 
 
@@ -342,7 +347,7 @@ def _diagnostics(result: Result) -> _Section:
             _table(pd.Series(rows, name="value").rename_axis("diagnostic").to_frame()),
             _table(table[kept].rename_axis("parameter")),
         ],
-        on_screen=True,
+        css_class=_NOT_PRINTED,
     )
 
 
@@ -355,7 +360,7 @@ def _settings(result: Result) -> _Section:
         [
             _table(pd.Series(short, name="value").rename_axis("setting").to_frame()),
         ],
-        on_screen=True,
+        css_class=_NOT_PRINTED,
     )
 
 

@@ -185,6 +185,13 @@ def test_the_report_is_one_page_with_the_path_and_every_figure(result, tmp_path)
         assert f"<td>{cell}</td>\n      <td>{x:.1f}</td>\n      <td>{y:.1f}</td>" in html
     assert result.workspace.grid.crs_name in html
 
+    # The rule that hides all but the last 12 missions in print is that of their section.
+    [hides] = re.findall(r"\.(\w+) tbody tr:nth-last-child\(n \+ 13\)", html)
+    assert re.search(rf'<section class="{hides}">\s*<h2>Contact in each mission', html)
+    [screen] = re.findall(r"\.(\w+) { display: none }", html)
+    for heading in ("Diagnostics", "Settings"):
+        assert re.search(rf'<section class="{screen}">\s*<h2>{heading}', html)
+
 
 def test_the_report_lists_the_cells_of_the_path_that_were_never_entered(result):
     entered = {bound.cell for mission in result.missions for bound in mission.bounds}
