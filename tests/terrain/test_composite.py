@@ -97,6 +97,19 @@ def test_bad_input():
     empty = xr.Dataset({name: ("pixel", np.full(5, np.nan)) for name in SIGNS})
     with pytest.raises(TrustboError, match="no pixel"):
         CompositeIndex(SIGNS).fit(empty)
+    with pytest.raises(TrustboError, match="feature"):
+        CompositeIndex({})
+
+
+def test_samples_are_matched_by_their_dims():
+    common, noise = np.random.default_rng(0).normal(size=(2, 40, 40))
+    values = {"slope": common, "tri": common + 0.1 * noise, "open": noise - common}
+    features = xr.Dataset({name: (("y", "x"), x) for name, x in values.items()})
+    turned = features.assign(tri=features["tri"].transpose("x", "y"))
+    for given in (turned, dict(turned.data_vars)):
+        index = CompositeIndex(SIGNS).fit(given)
+        xr.testing.assert_identical(index.fitted, CompositeIndex(SIGNS).fit(values).fitted)
+        np.testing.assert_array_equal(index.transform(given), index.transform(values))
 
 
 def test_a_fitted_index_is_read_back_as_it_was(tmp_path):

@@ -1,5 +1,7 @@
 """From pixels to cells."""
 
+import json
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -8,6 +10,7 @@ from trustbo.errors import TrustboError
 from trustbo.terrain import synthetic_terrain
 from trustbo.terrain.features import canopy_cover
 from trustbo.workspace import Sight, Workspace
+from trustbo.workspace.netcdf import workspace_from_tree, workspace_to_tree
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +50,47 @@ def test_canopy_of_the_features_is_that_of_the_assumed_sight(terrain):
 def test_features_that_are_none_are_refused(terrain, features):
     with pytest.raises(TrustboError, match="feature"):
         Workspace.from_terrain(terrain, (4, 3), features=features)
+
+
+@pytest.mark.parametrize(
+    "name", [3, "", "a/b", "cover ", "%", "line_of_sight", "passable", "x", "spatial_ref"]
+)
+def test_names_that_a_feature_cannot_have_are_refused(terrain, name):
+    with pytest.raises(TrustboError, match="feature"):
+        Workspace.from_terrain(terrain, (4, 3), features={name: ["slope", "tri"]})
+
+
+def test_a_feature_needs_at_least_one_feature_of_pixels(terrain):
+    with pytest.raises(TrustboError, match="feature"):
+        Workspace.from_terrain(terrain, (4, 3), features={"ease": []})
+
+
+def test_names_of_features_and_attributes_of_a_terrain_survive_a_file(terrain, tmp_path):
+    attrs = {
+        "title": "Höhe",
+        "year": 2013,
+        "box": [1.5, 2.5],
+        "tags": ["a", "b"],
+        "is_final": True,
+        "source": {"by": None},
+    }
+    names = ("ease", "2nd", "Grün-%, no. 1")
+    features = {name: ["slope", "tri"] for name in names}
+    workspace = Workspace.from_terrain(
+        terrain.assign_attrs(attrs), (4, 3), features=features, bounds=False
+    )
+    workspace_to_tree(workspace).to_netcdf(tmp_path / "workspace.nc")
+    with xr.open_datatree(tmp_path / "workspace.nc") as tree:
+        again = workspace_from_tree(tree.load())
+
+    assert again.features == names
+    assert again.composites.keys() == workspace.composites.keys()
+    found = again.terrain.attrs
+    assert (found["title"], found["year"], found["tags"]) == ("Höhe", 2013, ["a", "b"])
+    assert list(found["box"]) == [1.5, 2.5]
+    assert json.loads(found["is_final"]) is True
+    assert json.loads(found["source"]) == {"by": None}
+    assert workspace.terrain.attrs == attrs  # the user's terrain is unchanged
 
 
 def test_pixel_maps_are_those_of_the_terrain(terrain):

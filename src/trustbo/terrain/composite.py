@@ -41,9 +41,9 @@ class CompositeIndex:
 
     def __init__(self, signs: Mapping[str, int], fitted: xr.Dataset | None = None) -> None:
         """Set the features with their signs and, optionally, the `fitted` of an earlier fit."""
-        require_kind(
-            "signs", signs, Mapping, "give the sign of each feature, such as {'slope': -1}"
-        )
+        remedy = "give the sign of each feature, such as {'slope': -1}"
+        if not require_kind("signs", signs, Mapping, remedy):
+            raise TrustboError(f"a composite index needs at least one feature; {remedy}.")
         self.signs = dict(signs)
         self.fitted = xr.Dataset() if fitted is None else fitted
 
@@ -52,6 +52,7 @@ class CompositeIndex:
 
         Args:
             features: Values of each feature, arrays of one shape; samples with a NaN are left out.
+                The dims of DataArrays are put in the order of the first feature's.
 
         Raises:
             TrustboError: A declared feature is missing, or no sample has all features.
@@ -150,4 +151,9 @@ class CompositeIndex:
         missing = [name for name in self.signs if name not in features]
         if missing:
             raise TrustboError(f"the composite needs {', '.join(missing)}; got {list(features)}.")
-        return [np.asarray(features[name], float) for name in self.signs]
+
+        columns = [features[name] for name in self.signs]
+        if isinstance(columns[0], xr.DataArray):
+            dims = columns[0].dims
+            columns = [x.transpose(*dims) if isinstance(x, xr.DataArray) else x for x in columns]
+        return [np.asarray(x, float) for x in columns]

@@ -4,6 +4,7 @@ Overwatch involves two cells, so awareness is defined for each bound, that is, f
 into the cell. The awareness of a cell applies to all moves into the cell.
 """
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -24,6 +25,10 @@ from trustbo.workspace.surface import Surface
 
 _DIMS = ("robot", "move", "row", "col", "feature")
 _AXES = "(robot, row, col, feature) or (robot, move, row, col, feature) with 8 moves"
+_RESERVED = ("passable", "x", "y", "spatial_ref")
+"""Names of other variables in the dataset of pixels."""
+_STORABLE = re.compile(r"\w([^/\x00-\x1f\x7f]*[^/\x00-\x1f\x7f\s])?")
+"""Names that variables of a netCDF file can have."""
 
 
 def pixel_maps(
@@ -38,16 +43,22 @@ def pixel_maps(
         A dataset (y, x) of each feature, in [0, 1], and the fitted composite indices.
 
     Raises:
-        TrustboError: A feature is unknown, has a name that is reserved for line of sight, or is
-            used unchanged but has values outside [0, 1].
+        TrustboError: A feature is unknown, has a name that is reserved or that files cannot store,
+            or is used unchanged but has values outside [0, 1].
     """
     remedy = "map each feature to its pixel features, such as {'ease': ('slope', 'tri')}"
     if not require_kind("features", features, Mapping, remedy):
         raise TrustboError(f"features must contain at least one feature; {remedy}.")
 
     for name in features:
-        if is_line_of_sight(name):
+        require_kind("name of a feature", name, str, remedy)
+        if is_line_of_sight(name) or name in _RESERVED:
             raise TrustboError(f"feature name {name!r} is reserved; choose another name.")
+        if not _STORABLE.fullmatch(name):
+            raise TrustboError(
+                f"feature name {name!r} cannot be stored in a file; begin with a letter or a "
+                "digit, and use no '/'."
+            )
 
     def values_of(name: str) -> np.ndarray:
         compute = FEATURES[require_choice("feature", name, FEATURES)].compute

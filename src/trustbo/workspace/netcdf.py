@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict
 
+import numpy as np
 import xarray as xr
 
 from trustbo.files import to_json
@@ -16,14 +17,22 @@ from trustbo.workspace.workspace import Workspace
 
 
 def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
-    """Convert a workspace to a data tree."""
+    """Convert a workspace to a data tree.
+
+    Attributes of the terrain that netCDF cannot store become JSON.
+    """
     cells = xr.Dataset({"awareness": workspace.awareness, "passable": workspace.passable})
     tree = {"cells": cells}
     tree |= {f"composites/{n}": index.fitted for n, index in workspace.composites.items()}
 
     if workspace.terrain is not None and workspace.pixels is not None:
         pixels = workspace.pixels.drop_vars("spatial_ref", errors="ignore")  # in the terrain
-        tree |= {"terrain": workspace.terrain, "pixels": pixels}
+        terrain = workspace.terrain.copy()
+        terrain.attrs = {
+            name: value if _is_storable(value) else to_json(value)
+            for name, value in terrain.attrs.items()
+        }
+        tree |= {"terrain": terrain, "pixels": pixels}
 
     result = xr.DataTree.from_dict(tree)
     result.attrs = {
@@ -70,3 +79,12 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
     return Workspace(
         cells["awareness"], cells["passable"], grid, team, terrain, pixels, composites, posts
     )
+
+
+def _is_storable(value: object) -> bool:
+    """Return whether netCDF can store an attribute: text, numbers, or a list of either."""
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        return False
+    return array.ndim <= 1 and array.dtype.kind in "iufU"

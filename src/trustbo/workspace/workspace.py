@@ -111,7 +111,7 @@ class Workspace(Summary):
         Raises:
             TrustboError: The dataset is not a terrain, the grid is too fine for the raster, all
                 cells are too small for the team, no cell is passable, or a feature has a reserved
-                name.
+                name or a name that files cannot store.
 
         Example:
             >>> tb.Workspace.from_terrain(terrain, shape=(10, 10), team=tb.Team(n_robots=3))
