@@ -86,6 +86,13 @@ def test_range_and_field_of_view_limit_sight():
     assert detection_probability(tilted, BARE, here, there, pair) == pytest.approx(0.0)
 
 
+@pytest.mark.parametrize("extinction", [1, np.float32(1.0), np.int64(1), np.inf])
+def test_numbers_of_a_sight_are_floats(extinction):
+    sight = Sight(extinction, np.int64(0))
+    assert type(sight.extinction) is type(sight.crown_base) is float
+    assert sight == Sight(float(extinction), 0.0)
+
+
 def test_one_position_is_in_the_pixel_that_many_are_in():
     surface = surface_of(np.zeros((40, 30)))._replace(pixel=(0.5, 2.0), origin=(3.0, 7.0))
     x, y = np.random.default_rng(0).uniform(-30.0, 80.0, (2, 500)).round(1)  # halves too

@@ -184,11 +184,14 @@ def openness(
     rows, cols = ground.shape
     coarse = np.empty((-(-rows // rays.BLOCK), -(-cols // rays.BLOCK)))
 
+    # As floats, because kernels are compiled again for whole numbers.
+    reach = float(reach)
+    heights = float(eye), float(target)
     canopy = float(extinction), float(crown_base)
 
     def work(first: int, last: int) -> None:
         maps = ground, surface, pixel_size(terrain)
-        rays.openness(*maps, reach, (eye, target), canopy, coarse, first, last)
+        rays.openness(*maps, reach, heights, canopy, coarse, first, last)
 
     over_rows(work, len(coarse))
     whole = coarse.repeat(rays.BLOCK, axis=0).repeat(rays.BLOCK, axis=1)[:rows, :cols]

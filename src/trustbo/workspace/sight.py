@@ -45,10 +45,15 @@ class Sight:
     crown_base: float = 0.3
 
     def __post_init__(self) -> None:
-        require_share("crown_base", self.crown_base)
+        # Kernels are compiled again for whole numbers, and the name of a map differs with them.
+        crown_base = require_share("crown_base", self.crown_base)
         is_solid = isinstance(self.extinction, float) and self.extinction == math.inf
+        extinction = math.inf
         if not is_solid:
-            require_positive("extinction", self.extinction, or_zero=True)
+            extinction = require_positive("extinction", self.extinction, or_zero=True)
+
+        object.__setattr__(self, "extinction", extinction)
+        object.__setattr__(self, "crown_base", crown_base)
 
 
 def optics(watcher: Robot, watched: Robot) -> np.ndarray:
