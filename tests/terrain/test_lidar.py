@@ -155,6 +155,8 @@ def test_points_that_make_no_terrain_are_refused(tmp_path):
     for wrong in (
         write_las(tmp_path / "class.las", x, y, z, label),
         write_las(tmp_path / "line.las", x, np.full_like(y, 3.0), z),
+        write_las(tmp_path / "empty.las", [], [], []),
+        write_las(tmp_path / "noise.las", x, y, z, 7),
         write_las(tmp_path / "stray.las", x, y, stray, np.where(z == stray, 2, 1)),
         write_las(tmp_path / "degrees.las", x, y, z, crs="EPSG:4326"),
         write_las(tmp_path / "nowhere.las", x, y, z, crs=None),
@@ -166,6 +168,15 @@ def test_points_that_make_no_terrain_are_refused(tmp_path):
     assert nowhere.rio.crs.to_epsg() == 32633
     with pytest.raises(TrustboError, match="resolution"):
         read_lidar(tmp_path / "nowhere.las", 0.0)
+
+
+@pytest.mark.filterwarnings("ignore:.*heights in units of")
+def test_points_on_a_mountain_may_have_heights_in_feet(tmp_path):
+    x, y, z = lattice()
+    feet = 12_000.0 + z  # above the highest number of metres
+    path = write_las(tmp_path / "feet.las", x, y, feet, crs="EPSG:32613+6360")
+    dem = read_lidar(path)["dem"]
+    np.testing.assert_allclose(dem, (12_000.0 + plane_of(dem)) * 1200.0 / 3937.0, atol=1e-3)
 
 
 def test_lists_of_tiles_are_refused(tmp_path):

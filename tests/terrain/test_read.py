@@ -241,6 +241,31 @@ def test_a_band_is_found_by_its_name_in_files_and_arrays(tmp_path):
         np.testing.assert_allclose(terrain["dsm"], plane() + 9.0)
 
 
+def test_an_alpha_band_may_be_before_the_band_of_heights(tmp_path):
+    opaque = np.full((8, 10), 255, "float32")
+    colours = [ColorInterp.gray, ColorInterp.alpha, ColorInterp.undefined]
+    path = write(tmp_path / "dem.tif", plane() + 9.0, opaque, plane(), colours=colours)
+    with rasterio.open(path, "r+") as file:
+        file.set_band_description(3, "dem")
+    with pytest.warns(UserWarning, match="2 bands .* band 3 is used"):
+        terrain = read_terrain(path, array(plane()))
+    np.testing.assert_allclose(terrain["dem"], plane())
+
+
+@pytest.mark.parametrize("number", ["tenth", None, np.nan, [0.1, 1.0]])
+@pytest.mark.parametrize("key", ["scale_factor", "add_offset"])
+def test_scales_and_offsets_that_are_not_numbers_are_refused(key, number):
+    with pytest.raises(TrustboError, match=key):
+        read_terrain(array(plane()).assign_attrs({key: number}))
+
+
+def test_a_fill_may_be_too_large_to_be_scaled():
+    largest = -float(np.finfo(float).max)
+    stored = array(plane(largest, float)).assign_attrs(_FillValue=largest, scale_factor=[2.0])
+    terrain = read_terrain(stored, stored)  # warnings are errors
+    np.testing.assert_allclose(terrain["dem"], 2.0 * plane(np.nan, float))
+
+
 def test_attributes_of_all_bands_are_those_of_the_chosen_band(tmp_path):
     path = write(tmp_path / "feet.tif", plane(), 10.0 * plane())
     with rasterio.open(path, "r+") as file:

@@ -36,9 +36,10 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
     there is no such axis.
 
     Raises:
-        TrustboError: Values are not real numbers, or are impossible as heights on land: undeclared
-            fill values, fill values blended with heights, or heights in another unit. The same
-            error is raised if the unit is unknown, or if the band and the CRS disagree on it.
+        TrustboError: Values or attributes are not real numbers, or values are impossible as heights
+            on land: undeclared fill values, fill values blended with heights, or heights in another
+            unit. The same error is raised if the unit is unknown, or if the band and the CRS
+            disagree on it.
     """
     name = str(stored.name)
     attrs = stored.attrs
@@ -58,12 +59,13 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
         with np.errstate(over="ignore"):
             missing |= raw == fill  # rounded to the raster's type: float32 has no -3.4e38
 
-    scale = attrs.get("scale_factor", 1.0)
-    offset = attrs.get("add_offset", 0.0)
+    values[missing] = np.nan
+
+    scale = _number(name, attrs, "scale_factor", 1.0)
+    offset = _number(name, attrs, "add_offset", 0.0)
     suspicious = np.isin(values, _FILLS if scale != 1.0 else (*_FILLS, -999.0))
 
     heights = metres * (scale * values + offset)
-    heights[missing] = np.nan
     wrong = ~missing & (suspicious | (heights < LOWEST) | (heights > HIGHEST))
     if not wrong.any():
         _warn_of_zeros(heights, name)
@@ -90,6 +92,19 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
         f"that resampling has blended with heights. Pass nodata={value!r}, or resample the raster "
         "again with its fill value declared."
     )
+
+
+def _number(name: str, attrs: Mapping[str, Any], key: str, default: float) -> float:
+    """Return an attribute that is one finite number; raises TrustboError for other values."""
+    try:
+        number = np.asarray(attrs.get(key, default), float).item()
+    except (TypeError, ValueError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise TrustboError(
+            f"{name} declares {key} = {attrs[key]!r}, which is not a number; correct the attribute."
+        )
+    return number
 
 
 def _fills(name: str, attrs: Mapping[str, Any], nodata: float | None) -> list[float]:

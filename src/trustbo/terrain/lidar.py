@@ -14,7 +14,7 @@ from scipy.spatial import QhullError
 from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import HIGHEST, LOWEST
-from trustbo.terrain.place import require_map
+from trustbo.terrain.place import require_map, vertical_axis
 from trustbo.terrain.read import check_size, read_terrain
 
 GROUND_GAP = 10.0
@@ -108,14 +108,19 @@ def _read_points(path: str, given: object) -> tuple[np.ndarray, np.ndarray, CRS]
     label = np.asarray(cloud.classification, np.uint8)
     usable = ~np.isin(label, _NOISE) & (np.asarray(cloud.withheld) == 0)
 
-    xyz = np.column_stack([cloud.x, cloud.y, cloud.z])[usable]  # pyright: ignore[reportArgumentType, reportCallIssue]
-    if ((xyz[:, 2] < LOWEST) | (xyz[:, 2] > HIGHEST)).any():
-        raise TrustboError(
-            f"{path!r} has points outside {LOWEST:g} to {HIGHEST:g} m; classify them as noise (7), "
-            "or correct the unit."
-        )
+    if not usable.any():
+        raise TrustboError(f"{path!r} has no points, or all of them are noise or withheld.")
 
     crs = require_map(repr(path), own, given)
     if crs.is_geographic:
         raise TrustboError(f"{path!r} is in degrees; reproject its points to a UTM zone.")
+
+    xyz = np.column_stack([cloud.x, cloud.y, cloud.z])[usable]  # pyright: ignore[reportArgumentType, reportCallIssue]
+    unit, _ = vertical_axis(crs)  # the heights are converted with the rasters
+    metres = xyz[:, 2] * (unit or 1.0)
+    if ((metres < LOWEST) | (metres > HIGHEST)).any():
+        raise TrustboError(
+            f"{path!r} has points outside {LOWEST:g} to {HIGHEST:g} m; classify them as noise (7), "
+            "or correct the unit."
+        )
     return xyz, label[usable] == _GROUND, crs

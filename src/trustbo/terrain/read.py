@@ -253,8 +253,9 @@ def _of_file(file: DatasetReader, role: str, name: str) -> xr.DataArray:
         )
 
     alpha = [k for k, colour in enumerate(file.colorinterp) if colour == ColorInterp.alpha]
-    opaque = [text or "" for k, text in enumerate(file.descriptions) if k not in alpha or k == 0]
-    band = _band_of_heights(opaque, role)
+    opaque = [k for k in range(file.count) if k not in alpha or k == 0]
+    names = [file.descriptions[k] or "" for k in opaque]
+    band = opaque[_band_of_heights(names, role)]
 
     colour = file.colorinterp[band]
     if colour not in (ColorInterp.undefined, ColorInterp.gray):
@@ -262,7 +263,7 @@ def _of_file(file: DatasetReader, role: str, name: str) -> xr.DataArray:
             f"{name} is a picture: its band {band + 1} has the colour {colour.name!r}; give a "
             "raster of heights, e.g. one of its bands, extracted with gdal_translate -b."
         )
-    _warn_of_bands(opaque, band, name)
+    _warn_of_bands(names, band, name)
 
     stored = file.read(band + 1, masked=True)
     values = stored.astype(np.result_type(stored, np.float32)).filled(np.nan)
