@@ -110,6 +110,13 @@ def test_a_workspace_of_arrays():
     assert workspace.grid.center((2, 0)) == (10.0, 10.0)
 
 
+def test_a_workspace_without_bounds_has_a_text():
+    alone = np.arange(9).reshape(3, 3) == 4  # one passable cell
+    text = repr(Workspace.from_awareness(np.zeros((2, 3, 3, 1)), alone))
+    assert "11% passable" in text
+    assert "nan" not in text
+
+
 def test_bad_arrays_are_refused():
     awareness = np.full((2, 3, 4, 2), 0.5)
     with pytest.raises(TrustboError, match=r"with 8 moves; got shape \(3, 4, 2\)"):

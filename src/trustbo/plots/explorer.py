@@ -305,16 +305,17 @@ def _text(mission: xr.Dataset, objective: str) -> str:
     value = float(mission["objective"])
     predicted = f"predicted objective {value:z.3f}"
     if objective == "lost_contact":
-        predicted = f"contact lost {_lost(mission)}, predicted {-value:z.2f} bounds"
+        lost = _measured(mission, "contact_lost", 2)
+        predicted = f"contact lost {lost}, predicted {-value:z.2f} bounds"
     return (
         f"<b>Mission {int(mission['iteration'])}</b>: {escape(str(mission['status'].item()))}, "
-        f"contact rate {float(mission['contact_rate']):.3f}, "
+        f"contact rate {_measured(mission, 'contact_rate', 3)}, "
         f"plan of {len(_cells(mission['path'].values)) - 1} bounds, "
         f"{predicted}"
     )
 
 
-def _lost(mission: xr.Dataset) -> str:
-    """Return the contact that a mission lost, as text."""
-    lost = float(mission["contact_lost"]) if "contact_lost" in mission else np.nan
-    return f"{lost:z.2f}" if np.isfinite(lost) else "not measured"
+def _measured(mission: xr.Dataset, name: str, n_decimals: int) -> str:
+    """Return a quantity of a mission as text."""
+    value = float(mission[name]) if name in mission else np.nan
+    return f"{value:z.{n_decimals}f}" if np.isfinite(value) else "not measured"

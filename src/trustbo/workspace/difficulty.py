@@ -64,7 +64,7 @@ def difficulty_of(workspace: Workspace) -> Difficulty:
     (see `pursuit.largest_tilt`), divided by the tangent of `max_slope`; it is at most 2.
     `narrowness` is 1 / (1 + w / 2 m), where w is the smallest distance to an impassable pixel.
     `tightness` is log(1 + l / 1 m) / 3, where l is the length of the route beside impassable
-    pixels. All measures except the tilt are averaged over the next moves of a unit.
+    pixels. All measures are averaged over the next moves of a unit, which have the same tilt.
     """
     if workspace not in _cached:
         exists = possible_next(workspace.passable_bounds.values)
@@ -104,7 +104,7 @@ def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.nda
             down, right = MOVES[m]
             left = row - down, col - right
             follows = np.flatnonzero(exists[m, row, col]).tolist()
-            measured: dict[bytes, np.ndarray] = {}  # keyed by the robot and its route
+            measured: dict[tuple[int, bytes], np.ndarray] = {}  # keyed by the robot and its route
             for n in follows:
                 onward = None if n == END else (row + MOVES[n][0], col + MOVES[n][1])
                 routes = posts.bound_routes(left, (row, col), onward)
@@ -119,7 +119,7 @@ def _of_bound(
     easy: np.ndarray,
     room: np.ndarray,
     routes: Sequence[np.ndarray | None],
-    measured: dict[bytes, np.ndarray],
+    measured: dict[tuple[int, bytes], np.ndarray],
 ) -> np.ndarray:
     """Compute the maximum of each measure over the robots' routes in a bound, shape (measure,).
 
@@ -131,7 +131,7 @@ def _of_bound(
     for i, (robot, route) in enumerate(zip(robots, routes, strict=True)):
         if route is None:
             continue
-        key = bytes([i]) + route.tobytes()
+        key = i, route.tobytes()
         if key not in measured:
             measured[key] = _of_route(posts.surface, easy, room, robot, route)
         worst = np.maximum(worst, measured[key])

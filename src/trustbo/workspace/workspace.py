@@ -42,6 +42,9 @@ from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface, surface_of
 
+_MIDDLE = (0.1, 0.9)
+"""Quantiles at the ends of the middle 80 % of bounds."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Workspace(Summary):
@@ -209,11 +212,7 @@ class Workspace(Summary):
         team = self.team
         n_pixels = [] if self.terrain is None else self.terrain["dem"].shape
 
-        shown = self.awareness.mean("robot")
-        spread = [
-            (f"  {name}", f"{float(one.quantile(0.1)):.2f} to {float(one.quantile(0.9)):.2f}")
-            for name, one in ((n, shown.sel(feature=n)) for n in self.features)
-        ]
+        spread = [(f"  {name}", self._middle_of(name)) for name in self.features]
 
         return [
             ("cells", f"{grid.shape[0]} x {grid.shape[1]}, {free.mean():.0%} passable"),
@@ -225,6 +224,15 @@ class Workspace(Summary):
             ("sight", "none assumed" if self.sight is None else str(self.sight)),
             ("terrain", " x ".join(map(str, n_pixels)) + " pixels" if n_pixels else "none"),
         ]
+
+    def _middle_of(self, feature: str) -> str:
+        """Return the range of a feature in the middle 80 % of bounds, as text."""
+        values = self.awareness.sel(feature=feature).mean("robot").values
+        known = values[np.isfinite(values)]
+        if not len(known):
+            return "no bounds"
+        low, high = np.quantile(known, _MIDDLE)
+        return f"{low:.2f} to {high:.2f}"
 
     @property
     def surface(self) -> Surface | None:
