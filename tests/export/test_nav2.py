@@ -12,7 +12,7 @@ from worlds import unequal_robots
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.export import Frame, write_nav2
-from trustbo.export.nav2 import write_ros_map
+from trustbo.export.nav2 import occupancy
 from trustbo.workspace.moves import bounds_along
 
 
@@ -28,18 +28,19 @@ def picture(file):
 def test_pixels_are_the_costs_of_the_cells_at_their_centres(rotation, result, tmp_path):
     workspace, cost = result.workspace, result.maps()["cost"]
     grid, frame = workspace.grid, Frame(workspace.grid.center((1, 1)), rotation)
-    write_ros_map(tmp_path / "map.yaml", cost, workspace, frame=frame, pixel=3.0)
-    about = json.loads((tmp_path / "map.yaml").read_text())
-    values = picture(tmp_path / about["image"])[::-1]
+    write_nav2(tmp_path / "nav2", result, frame=frame, pixel=3.0)
+    about = json.loads((tmp_path / "nav2" / "cost_map.yaml").read_text())
+    values = picture(tmp_path / "nav2" / about["image"])[::-1]
     for row, col in [(0, 0), (0, 1), (1, 2), (2, 3)]:
         x, y = (frame.of_crs(grid.center((row, col))) - about["origin"][:2]) / about["resolution"]
         expected = 100 if not workspace.passable[row, col] else round(100 * float(cost[row, col]))
         assert values[int(y), int(x)] == min(expected, 98 if workspace.passable[row, col] else 100)
     assert (values[0, 0] == 255) == (rotation > 0.0)
-    for bad in ({"cost": cost + 1.0}, {"pixel": 1e-4}):
-        with pytest.raises(TrustboError, match=next(iter(bad))):
-            write_ros_map(tmp_path / "no.yaml", **{"cost": cost, "workspace": workspace,
-                          "frame": frame, "pixel": 3.0} | bad)  # fmt: skip
+    with pytest.raises(TrustboError, match="pixel"):
+        write_nav2(tmp_path / "no", result, frame=frame, pixel=1e-4)
+    assert not (tmp_path / "no").exists()
+    with pytest.raises(TrustboError, match="cost"):
+        occupancy(cost.values + 1.0, workspace, frame)
 
 
 def test_waypoints_are_stops_and_posts_that_look_at_the_lead(result, tmp_path):

@@ -169,6 +169,20 @@ def test_the_explorer_is_one_page_without_addresses(result, tmp_path):
     assert page._repr_html_().startswith("<iframe")
 
 
+@pytest.mark.filterwarnings("ignore:mission 2 is excluded")
+def test_the_explorer_says_that_contact_was_not_measured():
+    awareness = np.random.default_rng(0).uniform(size=(2, 3, 3, 2))
+    workspace = tb.Workspace.from_awareness(awareness)
+    campaign = tb.Campaign(workspace, (2, 0), (0, 2), fit={"draws": 100}, progress=False)
+    path = [(2, 0), (1, 1), (0, 2)]
+    for rate in (0.8, np.nan):
+        rates = np.full((2, 2), rate)
+        campaign.tell(tb.Mission.from_arrays(path, np.full((2, 2, 2), np.nan), rates))
+    html = campaign.explore().html
+    assert "contact rate 0.800" in html
+    assert "contact rate not measured" in html
+
+
 def test_the_report_is_one_page_with_the_path_and_every_figure(result, tmp_path):
     write_report(tmp_path / "report.html", result)
     html = (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -1,7 +1,6 @@
 """Files for GIS: maps as GeoTIFF, plans as GeoJSON, and missions as CSV."""
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from shapely import affinity
 
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_kind
-from trustbo.files import FilePath, write_file, write_text
+from trustbo.files import FilePath, to_path, write_file, write_text
 from trustbo.logs.table import to_frame
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
@@ -21,6 +20,9 @@ from trustbo.terrain.place import converted, quiet_affine
 
 LEAD = "lead"
 """Name of the lead in exported files."""
+_NO_CRS = "this export needs a CRS; make the workspace with Workspace.from_terrain."
+_TIFF = (".tif", ".tiff")
+"""Suffixes of a GeoTIFF."""
 _BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
 
 
@@ -43,7 +45,9 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
     """
     maps = maps.maps() if isinstance(maps, Result) else maps
     require_kind("maps", maps, xr.Dataset, "give a result or a campaign, or its maps()")
-    target = require_suffix(path, ".tif", ".tiff")
+    target = to_path(path)
+    if target.suffix.lower() not in _TIFF:
+        raise TrustboError(f"{str(target)!r} must end in {' or '.join(_TIFF)}.")
 
     if maps.rio.crs is None:
         raise TrustboError(_NO_CRS)
@@ -155,14 +159,6 @@ def write_csv(path: FilePath, result: Result) -> None:
     write_text(path, table.to_csv(index=False, lineterminator="\n"))
 
 
-def require_suffix(path: FilePath, *suffixes: str) -> Path:
-    """Return the path of a file; raises TrustboError unless it ends in one of these suffixes."""
-    file = Path(path)
-    if file.suffix.lower() not in suffixes:
-        raise TrustboError(f"{str(file)!r} must end in {' or '.join(suffixes)}.")
-    return file
-
-
 def _of(values: Any) -> Any:
     """Return posts or routes of a plan; an empty tuple if the plan has no terrain."""
     return () if values is None else values
@@ -188,10 +184,10 @@ def _cells(plan: Plan) -> list[dict[str, Any]]:
 
 def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) -> dict[str, Any]:
     """Make a GeoJSON Point at a position (2,) or LineString of positions (point, 2), CRS metres."""
-    if plan.workspace.grid.crs is None:
+    crs = plan.workspace.grid.crs
+    if crs is None:
         raise TrustboError(_NO_CRS)
 
-    crs = plan.workspace.grid.crs
     xy = np.atleast_2d(places)
     lon, lat = converted(crs, "EPSG:4326", *xy.T)
 
@@ -218,6 +214,3 @@ def cut_at_180(line: shapely.LineString) -> shapely.Geometry:
                   if one.geom_type == "LineString" and not one.is_empty]  # fmt: skip
 
     return shapely.MultiLineString(parts)
-
-
-_NO_CRS = "this export needs a CRS; make the workspace with Workspace.from_terrain."

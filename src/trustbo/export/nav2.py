@@ -26,8 +26,8 @@ from trustbo.errors import (
     require_position,
     require_positive,
 )
-from trustbo.export.gis import LEAD, require_suffix
-from trustbo.files import FilePath, to_path, write_file
+from trustbo.export.gis import LEAD
+from trustbo.files import FilePath, read_file, to_path, write_file
 from trustbo.planning import Plan
 from trustbo.planning.problem import mean_of
 from trustbo.workspace import Workspace
@@ -207,7 +207,7 @@ def _about(frame: Frame, workspace: Workspace) -> bytes:
 
 def _require_same_frame(file: Path, content: bytes) -> None:
     """Check that the files that stay in a folder are in the frame of the waypoints."""
-    if file.exists() and file.read_bytes() != content:
+    if file.exists() and read_file(file) != content:
         raise TrustboError(
             f"the files in {str(file.parent)!r} are in another frame; pass their frame, which is "
             f"in {file.name}, or use another folder."
@@ -234,39 +234,13 @@ def _require_file_names(robots: Sequence[str]) -> None:
 def _write(files: Mapping[Path, bytes]) -> None:
     """Write the contents of files, in order."""
     for path, content in files.items():
-        write_file(path, lambda file, content=content: file.write_bytes(content))
-
-
-def write_ros_map(
-    path: FilePath,
-    cost: xr.DataArray,
-    workspace: Workspace,
-    *,
-    frame: Frame,
-    pixel: float | None = None,
-) -> None:
-    """Write a cost map for the map_server of ROS 1 or Nav2, as a .yaml and a .pgm file.
-
-    Args:
-        path: .yaml file to write or replace.
-        cost: Cost of each cell, in [0, 1], such as `Result.maps()["cost"]`; NaN if unknown. A pixel
-            has the value 100 times the cost, at most 98; 100 means impassable and 255 means
-            unknown.
-        workspace: Workspace of the cells.
-        frame: Frame of the pixels. Each pixel has the cost of the cell at the pixel's centre.
-        pixel: Side length of a pixel, in metres; by default a tenth of a cell's shorter side.
-
-    Raises:
-        TrustboError: A cost is outside [0, 1], the frame is not a `Frame` or its origin is far off
-            the map, the map has too many pixels, or a file cannot be written.
-    """
-    _write(_ros_map(require_suffix(path, ".yaml", ".yml"), cost, workspace, frame, pixel))
+        write_file(path, content)
 
 
 def _ros_map(
     target: Path, cost: xr.DataArray, workspace: Workspace, frame: Frame, pixel: float | None
 ) -> dict[Path, bytes]:
-    """Return the files of `write_ros_map` and their contents."""
+    """Return a cost map for the map_server of Nav2: a .yaml and a .pgm file with their contents."""
     values, corner, side = occupancy(cost.values, workspace, frame, pixel)
     picture = target.with_suffix(".pgm")
     # The first row of an image is in the north. In raw mode, map_server reads bytes as costs.
@@ -281,7 +255,19 @@ def _ros_map(
 def occupancy(
     cost: np.ndarray, workspace: Workspace, frame: Frame, pixel: float | None = None
 ) -> tuple[np.ndarray, list[float], float]:
-    """Return pixels (row, col), southern row first, the lower left corner and the pixel size."""
+    """Return pixels (row, col), southern row first, the lower left corner and the pixel size.
+
+    Args:
+        cost: Cost of each cell (row, col), in [0, 1]; NaN if unknown. A pixel has the value 100
+            times the cost, at most 98; 100 means impassable and 255 means unknown.
+        workspace: Workspace of the cells.
+        frame: Frame of the pixels. Each pixel has the cost of the cell at the pixel's centre.
+        pixel: Side length of a pixel, in metres; by default a tenth of a cell's shorter side.
+
+    Raises:
+        TrustboError: A cost is outside [0, 1], the frame is not a `Frame` or its origin is far off
+            the map, or the map has too many pixels.
+    """
     cost = without_rounding(cost)
     if ((cost < 0.0) | (cost > 1.0)).any():
         raise TrustboError(
