@@ -17,10 +17,12 @@ from trustbo.planning import Plan
 from trustbo.plots.maps import (
     BRIGHT_HIGH,
     BRIGHT_LOW,
+    cells_of,
     contours,
     extent_of,
     is_good_high,
     is_trust,
+    positions_of,
     robust_limits,
     trust_limits,
 )
@@ -133,7 +135,7 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     plot = _plot_cells(plan, names, cells, colours)
     plot.add_layout(bar, "below")
 
-    paths = [_places(_cells(steps), grid) for steps in history["path"].values]
+    paths = [_places(cells_of(steps), grid) for steps in history["path"].values]
     texts = [_text(history.isel(iteration=i), plan.objective) for i in range(len(paths))]
     n_missions = len(paths)
     planned = models.ColumnDataSource(paths[-1])
@@ -274,14 +276,9 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
         plot.multi_line([r[:, 0] for r in routes], [r[:, 1] for r in routes], **look)
 
 
-def _cells(steps: np.ndarray) -> list[Cell]:
-    """Return the cells of a path in a history, without the padding of -1."""
-    return [(int(row), int(col)) for row, col in steps if row >= 0]
-
-
 def _places(path: Sequence[Cell], grid: Grid) -> dict[str, Any]:
-    """Return the x and y of a path's cells, in metres from the lower left corner of the grid."""
-    x, y = (np.array([grid.center(cell) for cell in path]) - grid.corner).T
+    """Return the data source of a line along a path; see `positions_of`."""
+    x, y = positions_of(path, grid)
     return {"x": x.tolist(), "y": y.tolist()}
 
 
@@ -310,7 +307,7 @@ def _text(mission: xr.Dataset, objective: str) -> str:
     return (
         f"<b>Mission {int(mission['iteration'])}</b>: {escape(str(mission['status'].item()))}, "
         f"contact rate {_measured(mission, 'contact_rate', 3)}, "
-        f"plan of {len(_cells(mission['path'].values)) - 1} bounds, "
+        f"plan of {len(cells_of(mission['path'].values)) - 1} bounds, "
         f"{predicted}"
     )
 

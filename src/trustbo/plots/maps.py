@@ -117,7 +117,7 @@ def trust_maps(
     chosen = [i for i in missions if 1 <= i <= n_missions]
     maps = [history["trust_map"].sel(iteration=i) for i in chosen] + [trust_map]
     steps = [history["path"].sel(iteration=i).values for i in chosen] + [np.array(path)]
-    paths = [[(int(row), int(col)) for row, col in cells if row >= 0] for cells in steps]
+    paths = [cells_of(cells) for cells in steps]
     learned = [i - 1 for i in chosen] + [n_missions]
 
     values = np.stack([trust.transpose("row", "col").values for trust in maps])
@@ -292,9 +292,20 @@ def require_path_of_cells(path: Sequence[Cell], workspace: Workspace) -> list[Ce
     return cells
 
 
+def cells_of(steps: np.ndarray) -> list[Cell]:
+    """Return the cells of a path in a history, (step, 2), without the padding of -1."""
+    return [(int(row), int(col)) for row, col in steps if row >= 0]
+
+
+def positions_of(path: Sequence[Cell], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Return x and y of a path's cells, each (cell,), m from the lower left corner of the grid."""
+    x, y = (np.array([grid.center(cell) for cell in path]) - grid.corner).T
+    return x, y
+
+
 def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
     """Plot a path over a map, from its start (circle) to its goal (star)."""
-    x, y = (np.array([grid.center(cell) for cell in path]) - grid.corner).T
+    x, y = positions_of(path, grid)
     (line,) = ax.plot(x, y, color="white", linewidth=1.6, solid_joinstyle="round")
     line.set_path_effects(outlined(3.2, "black"))
     ax.plot(x[0], y[0], "wo", markeredgecolor="black", markersize=6)

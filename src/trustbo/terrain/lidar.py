@@ -17,9 +17,9 @@ from trustbo.terrain.heights import HIGHEST, LOWEST
 from trustbo.terrain.place import require_map, vertical_axis
 from trustbo.terrain.read import check_size, read_terrain
 
-GROUND_GAP = 10.0
+_GROUND_GAP = 10.0
 """Maximum distance of a pixel to one with ground points, m."""
-MAX_GAP = 3.0
+_MAX_GAP = 3.0
 """Maximum distance of a pixel without returns to the one that fills it, m."""
 _GROUND = 2  # class of ground points (ASPRS LAS 1.4)
 _ROUNDING = 1e-6  # pixels; points this close to an edge are on it
@@ -44,7 +44,7 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
 
     Raises:
         TrustboError: laspy is not installed; the file is unreadable or has no projected CRS; there
-            are no ground points; heights are impossible; or no pixel has both heights.
+            are no points or no ground points; heights are impossible; or no pixel has both heights.
 
     Example:
         >>> terrain = tb.terrain.read_lidar("points.laz", resolution=1.0)
@@ -76,12 +76,12 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
             "the ground points (class 2) must span an area; classify the ground, e.g. with PDAL's "
             "filters.smrf."
         ) from None
-    dem[np.asarray(distance_transform_edt(no_ground, step)) > GROUND_GAP] = np.nan
+    dem[np.asarray(distance_transform_edt(no_ground, step)) > _GROUND_GAP] = np.nan
 
     # Heights above ground: on a slope, absolute heights would create steps and false canopy.
     canopy = np.maximum(highest - dem, 0.0)
     nearest: Any = distance_transform_edt(np.isnan(canopy), step, return_indices=True)
-    canopy = np.where(nearest[0] <= MAX_GAP, canopy[tuple(nearest[1])], np.nan)
+    canopy = np.where(nearest[0] <= _MAX_GAP, canopy[tuple(nearest[1])], np.nan)
 
     x = (corner[0] + centres[0, :, 0]) * step
     y = -(corner[1] + centres[:, 0, 1]) * step

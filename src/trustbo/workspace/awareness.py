@@ -99,9 +99,11 @@ def options_of(
 ) -> dict[str, dict[str, float]]:
     """Return arguments of pixel features that depend on the team and on the assumed sight.
 
-    Openness is computed for the team's sensor and target heights. Its range is the smallest of the
-    team's largest lidar range, the diagonal of a cell, and half the terrain's shorter side. The
-    canopy of openness and vegetation density is that of the assumed model of sight.
+    Openness is computed for the sensor height of the first robot of T2 and the target height of the
+    lead, so it depends on the order of robots whose sensors differ in height. Its range is the
+    smallest of the team's largest lidar range, the diagonal of a cell, and half the terrain's
+    shorter side. The canopy of openness and vegetation density is that of the assumed model of
+    sight.
     """
     sides = np.multiply(surface.ground.shape, surface.pixel)
     diagonal = float(np.hypot(grid.cell_height, grid.cell_width))

@@ -174,7 +174,10 @@ class Posts:
         return self._stops[cell]
 
     def _choose_stop(self, cell: Cell) -> np.ndarray:
-        """Choose the lead's stop among positions in a cell."""
+        """Choose the lead's stop among positions in a cell.
+
+        The lead looks for the first robot of T2; the heights of the others may differ.
+        """
         here = self._central_stop(cell)
         around = [self._central_stop(c) for c in self._around(cell)]
         goals = np.array([goal for goal in around if self._is_in_region(goal)])

@@ -82,13 +82,13 @@ def jittered(n: int) -> np.ndarray:
 
 
 def detection_probability(
-    surface: Surface, sight: Sight, sensor: np.ndarray, target: np.ndarray, optics: np.ndarray
+    surface: Surface, sight: Sight, sensor: np.ndarray, target: np.ndarray, view: np.ndarray
 ) -> np.ndarray:
     """Compute the probability that an ideal lidar detects each target, shape (ray,), in [0, 1].
 
     The probability is the transmittance along the ray if the target is within the lidar's range and
     vertical field of view, and 0 otherwise. The field of view tilts with the robot. Sensors and
-    targets have shape (ray, 2), in CRS metres. `optics` has shape (ray, 4) or (4,).
+    targets have shape (ray, 2), in CRS metres. `view` has shape (ray, 4) or (4,); see `optics`.
     """
     ends = _ends(
         surface.ground,
@@ -97,7 +97,7 @@ def detection_probability(
         surface.origin,
         sensor,
         plain(target),
-        plain(np.broadcast_to(optics, (len(sensor), 4))),
+        plain(np.broadcast_to(view, (len(sensor), 4))),
     )
 
     rasters = surface.ground, surface.canopy, surface.pixel
@@ -105,17 +105,17 @@ def detection_probability(
 
 
 def detection_between(
-    surface: Surface, sight: Sight, eye: np.ndarray, target: np.ndarray, optics: np.ndarray
+    surface: Surface, sight: Sight, eye: np.ndarray, target: np.ndarray, view: np.ndarray
 ) -> np.ndarray:
     """Compute the detection probability (...) between positions (..., 2), which are broadcast."""
     eye, target = np.broadcast_arrays(eye, target)
     ends = np.ascontiguousarray(eye).reshape(-1, 2), np.ascontiguousarray(target).reshape(-1, 2)
-    return detection_probability(surface, sight, *ends, optics).reshape(eye.shape[:-1])
+    return detection_probability(surface, sight, *ends, view).reshape(eye.shape[:-1])
 
 
 @_compiled
-def _ends(ground, gradient, pixel, origin, sensor, target, optics):
-    """Compute row, column and height of both ends of each ray, (ray, 6).
+def _ends(ground, gradient, pixel, origin, sensor, target, view):
+    """Compute row, column and height of both ends of each ray, (ray, 6); see `optics` for `view`.
 
     The first height is NaN if the target is out of view. The loop is separate from ray tracing so
     that the memory accesses of many rays overlap.
@@ -131,8 +131,8 @@ def _ends(ground, gradient, pixel, origin, sensor, target, optics):
         r1 = _inward(r1, n_rows)
         c1 = _inward(c1, n_cols)
 
-        z0 = rays.bilinear(ground, r0, c0) + optics[i, 0]
-        z1 = rays.bilinear(ground, r1, c1) + optics[i, 1]
+        z0 = rays.bilinear(ground, r0, c0) + view[i, 0]
+        z1 = rays.bilinear(ground, r1, c1) + view[i, 1]
 
         east = (c1 - c0) * pixel[1]
         north = (r0 - r1) * pixel[0]
@@ -146,7 +146,7 @@ def _ends(ground, gradient, pixel, origin, sensor, target, optics):
 
         # Distance from the plane of the robot's body, whose normal is (-gx, -gy, 1).
         above = abs(up - gx * east - gy * north) / math.sqrt(1.0 + gx * gx + gy * gy)
-        seen = distance <= optics[i, 2] and above <= optics[i, 3] * max(distance, 1e-9)
+        seen = distance <= view[i, 2] and above <= view[i, 3] * max(distance, 1e-9)
 
         ends[i, 0] = r0
         ends[i, 1] = c0
