@@ -1,6 +1,7 @@
 """Hazard: likelihood, places of lost missions, calibration, and what is counted."""
 
 import itertools
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -143,6 +144,28 @@ def margins(z, prior):
     """Margin in degrees for coordinates z (point,)."""
     of = prior.of_bounds(np.ones((1, 1)), ("tilt",), LIMIT)
     return of.values(np.column_stack([np.zeros_like(z), z, *np.zeros((2, len(z)))]))[1][:, 0]
+
+
+def test_a_vague_prior_on_the_strength_gives_the_posterior_of_quadrature():
+    """Strengths around 1e16 must not add rounding errors to the likelihood."""
+    n, failed = 7, 2
+    told = [mission(ROW[:2], "stuck" if k < failed else "ok") for k in range(n)]
+    prior = Hazard(log_strength=(-0.5, 10.0))
+    found = fit_hazard(told, workspace(), prior)
+
+    z = np.linspace(-6.0, 6.0, 1201)
+    s = np.exp(-0.5 + 10.0 * z)
+    m = special.expit(-7.5 + 1.5 * z[:, None])
+    a, b = s * m, s * (1.0 - m)
+    weight = stats.norm.pdf(z) * stats.norm.pdf(z)[:, None]
+    for k in range(n):  # the rising factorials, factor by factor
+        weight = weight * (a + k if k < failed else b + k - failed) / (s + k)
+    p = (a + failed) / (s + n)
+    mean = (weight * p).sum() / weight.sum()
+    sd = np.sqrt((weight * (p - mean) ** 2).sum() / weight.sum())
+
+    entered = found["p_fail"].sel(move="e", next_move="end").values[0, 1]
+    assert abs(entered - mean) < 4.5 * sd / np.sqrt(found.attrs["kish"])
 
 
 def test_prior_draws_of_the_margin_are_of_the_mixture():
@@ -425,12 +448,33 @@ def test_a_bad_proposal_is_refused(monkeypatch):
     assert caught.value.posterior.attrs["k_hat"] == 0.93
 
 
+def test_a_hazard_of_another_workspace_is_refused(hilly):
+    ws = workspace()
+    walls = np.ones((3, 3), bool)
+    walls[1, 1] = False
+    walled = tb.Workspace.from_awareness(np.full((1, 3, 3, 1), 0.5), walls)
+    with pytest.raises(TrustboError, match="bounds"):
+        BoundRisk(fit_hazard([], ws), walled)
+
+    flat = tb.Workspace.from_awareness(np.full((1, *hilly.grid.shape, 1), 0.5))
+    of_hilly = fit_hazard([], hilly).drop_vars("p_fail")
+    with pytest.raises(TrustboError, match="measures"):
+        BoundRisk(of_hilly, flat)
+
+
 def test_wrong_input_is_named():
     ws = workspace()
     with pytest.raises(TrustboError, match=r"where .*\(2, 2\)"):
         fit_hazard([], ws, lost=[LostMission(ROW, (2, 2))])
     with pytest.raises(TrustboError, match=r"a mission enters \(0, 2\), outside"):
         fit_hazard([mission(ROW)], workspace(2))
+    with pytest.raises(TrustboError, match="'quarry'"):
+        fit_hazard([replace(mission(ROW), map="quarry")], ws)
+    unmapped = tb.Mission.from_arrays(None, np.full((1, 1, 1), 0.5), np.full((1, 1), 0.5))
+    with pytest.raises(TrustboError, match="map"):
+        fit_hazard([unmapped], ws)
+    with pytest.raises(TrustboError, match="missions"):
+        fit_hazard(mission(ROW), ws)
     with pytest.raises(TrustboError, match="sd of intercept must be positive"):
         Hazard(intercept=(0.0, 0.0))
     with pytest.raises(TrustboError, match="doubt"):

@@ -22,8 +22,8 @@ import numpy as np
 import xarray as xr
 from scipy import special, stats
 
-from trustbo.data import Cell, Mission
-from trustbo.errors import PosteriorError, TrustboError, require_whole
+from trustbo.data import Cell, Mission, require_map
+from trustbo.errors import PosteriorError, TrustboError, require_list, require_whole
 from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, TILT, BoundPrior, Hazard
 from trustbo.hazard.risk import BoundRisk, add_lost
 from trustbo.hazard.trials import LostMission, Trials
@@ -45,6 +45,8 @@ _SMALLEST_P = 1e-12
 """Smallest probability of passing that is distinguished from 0."""
 _LARGEST_KHAT = 1e3
 """Largest k-hat that is stored, which keeps it finite even if the estimate is infinite."""
+_LARGE = 1e8
+"""Parameter of a Beta distribution from which log ratios of Gamma functions are expanded."""
 _POSITIONS = {"strength": -1, "margin": -3}
 """Positions of two parameters in the normal scores; see `Hazard.of_bounds`."""
 _MODES = {"strength": 1.5, "margin": 1.8}
@@ -66,7 +68,7 @@ def fit_hazard(
     """Fit the failure probability of every bound and next move by importance sampling.
 
     Args:
-        missions: Measured missions; may be empty.
+        missions: Measured missions on the map of the workspace; may be empty.
         workspace: Workspace of the missions; its terrain determines the difficulty of bounds.
             Without a terrain, all bounds have the same prior mean.
         hazard: Priors; by default `Hazard()`.
@@ -87,7 +89,8 @@ def fit_hazard(
         probabilities.
 
     Raises:
-        TrustboError: If the path of a mission skips cells or leaves the grid.
+        TrustboError: If a mission has no map or is on another map (see `Mission.map`), or if its
+            path skips cells or leaves the grid.
         PosteriorError: If the k-hat of the importance weights exceeds 0.7.
 
     Example:
@@ -96,6 +99,15 @@ def fit_hazard(
     """
     started = time.perf_counter()
     hazard = hazard or Hazard()
+    missions = require_list("missions", missions, Mission, "give a list of missions")
+    require_map("the hazard model", missions)
+    for j, mission in enumerate(missions):
+        if mission.map:
+            raise TrustboError(
+                f"mission {j} was driven on the map {mission.map!r}, not in this workspace; leave "
+                "it out."
+            )
+
     trials = Trials.from_missions(missions, lost, goal)
     difficulty = difficulty_of(workspace)
 
@@ -202,7 +214,14 @@ def _starts(prior: BoundPrior) -> np.ndarray:
 
 def _log_rising(x: np.ndarray, k: np.ndarray) -> np.ndarray:
     """Compute the log of Gamma(x + k) / Gamma(x)."""
-    return special.gammaln(x + k) - special.gammaln(x)
+    exact = special.gammaln(x + k) - special.gammaln(x)
+    if x.max(initial=0.0) < _LARGE:
+        return exact
+
+    # The difference of two large numbers has rounding errors; this expansion has an error of the
+    # order of k^3 / x^2 (Abramowitz and Stegun 1964, 6.1.47).
+    expanded = k * np.log(x) + 0.5 * k * (k - 1.0) / x
+    return np.where(x < _LARGE, exact, expanded)
 
 
 def impute(

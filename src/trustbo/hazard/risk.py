@@ -57,8 +57,8 @@ class BoundRisk(Summary):
         """Read the group `hazard` of a posterior (see `fit_hazard`) for a workspace.
 
         Raises:
-            TrustboError: If the group was made by version 0.4 or earlier, or if its cells are not
-                those of the workspace.
+            TrustboError: If the group was made by version 0.4 or earlier, or if its bounds or its
+                measures of difficulty are not those of the workspace.
         """
         difficulty = difficulty_of(workspace)
         shape = difficulty.unit.shape
@@ -69,8 +69,16 @@ class BoundRisk(Summary):
                 "again with the missions; posteriors of trustbo 0.4 have no next moves."
             )
 
-        self._mean = hazard["p_fail"].values if "p_fail" in hazard else None
         self.exists = difficulty.unit >= 0
+        self._mean = hazard["p_fail"].values if "p_fail" in hazard else None
+        if self._mean is not None:
+            is_bound = np.isfinite(self._mean).any(-1)
+            if not np.array_equal(is_bound, self.exists.any(-1)):
+                raise TrustboError(
+                    "the hazard posterior has other bounds than this workspace; call fit_hazard "
+                    "again with this workspace."
+                )
+
         self.trials = hazard["trials"].values
         self.failures = hazard["failures"].values
 
@@ -85,6 +93,13 @@ class BoundRisk(Summary):
         self._failures = self._of_units(self.failures)
 
         names = hazard["measure"].values.tolist()
+        missing = set(names) - set(difficulty.measures["measure"].values.tolist())
+        if missing:
+            raise TrustboError(
+                f"the hazard posterior needs the measures of difficulty {', '.join(names)}, which "
+                "a workspace without a terrain does not have; call fit_hazard again with this "
+                "workspace."
+            )
         limit = [n for n in LIMIT_NAMES if n in hazard]
         self._difficulty = difficulty.measures.sel(measure=names).values[is_first] - REFERENCE
         self.steepness = None
@@ -385,8 +400,9 @@ class PathRisk(NamedTuple):
     p_fail: np.ndarray
     """Posterior mean probability that each bound, once begun, ends the mission, shape (bound,)."""
     p_arrive: float
-    """Probability of reaching the goal. With draws, it is the mean over draws of the product of
-    1 - p_fail, because failures are correlated; without draws, it is the product of the means."""
+    """Probability of reaching the goal. Without draws, it is the product of the means 1 - p_fail.
+    With draws, this product is multiplied by the ratio of the mean of the product to the product of
+    the means, both over the draws, because failures are correlated."""
     p_arrive_band: tuple[float, float]
     """Ends of the 90 % band of `p_arrive` over the draws; NaN without draws."""
 
