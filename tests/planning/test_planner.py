@@ -7,6 +7,7 @@ import xarray as xr
 from dense_statespace import mission_of_params, trust_of_params
 from enumeration import paths_of, value_of
 from every_model import KINDS, draws_of
+from missions import counted_missions
 from scipy.special import expit
 
 from trustbo.errors import TrustboError
@@ -325,6 +326,45 @@ def test_walks_that_need_too_large_a_graph_are_refused():
         Planner(workspace, (0, 0), (59, 59), max_bounds=50_000).plan(
             TrustParams(0.5, np.array([0.3]), 0.1, 0.1, 0.1)
         )
+
+
+def test_with_a_risk_the_limit_is_on_the_states_that_know_the_bound_before(workspace, monkeypatch):
+    planner = Planner(workspace, *ENDS, max_bounds=12)
+    n_plain = len(planner.problem.paths.graph.cell)
+    with_risk = planner.with_risk(np.full((8, 5, 6), 0.01))
+    assert len(with_risk.problem.paths.paired.graph.cell) > 4 * n_plain
+
+    monkeypatch.setattr("trustbo.planning.paths._MOST_STATES", 2 * n_plain)
+    planner = Planner(workspace, *ENDS, max_bounds=12)
+    planner.plan(PARAMS)
+    with pytest.raises(TrustboError, match="max_bounds"):
+        planner.with_risk(np.full((8, 5, 6), 0.01)).plan(PARAMS)
+
+
+def test_logits_of_a_posterior_are_not_read_as_contact_rates():
+    workspace = Workspace.from_awareness(np.random.default_rng(0).uniform(size=(1, 1, 6, 2)))
+    missions = counted_missions("beta_binomial", n=3)[2]
+    posterior = fit(missions, PooledTrust(family="beta_binomial"), draws=100, progress=False)
+    planner = Planner(workspace, (0, 0), (0, 5))
+    path = tuple((0, k) for k in range(6))
+    for use in (
+        planner.plan,
+        planner.plan_draws,
+        planner.graph,
+        planner.robot_maps,
+        lambda given: planner.evaluate(path, given),
+        lambda given: planner.trust(given, as_rate=True),
+        lambda given: reference.plan(planner, given),
+    ):
+        with pytest.raises(TrustboError, match="family='beta_binomial'"):
+            use(posterior)
+
+    right = Planner(workspace, (0, 0), (0, 5), family="beta_binomial").plan(posterior)
+    lost = 1.0 - expit(right.trust.mean(1))
+    assert right.value == pytest.approx(-lost.sum(), rel=1e-9)
+    of_trust = Planner(workspace, (0, 0), (0, 5), "mean").plan(posterior)  # no rates
+    assert of_trust.value == pytest.approx(right.trust.mean(), rel=1e-9)
+    assert planner.trust(posterior, cell=(0, 3)).notnull().all()
 
 
 def test_costs_risks_and_starts_are_read_by_name(workspace):

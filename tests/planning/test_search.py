@@ -1,5 +1,7 @@
 """Plans against all admissible paths written out, against networkx, and by closed forms."""
 
+import pickle
+
 import jax.numpy as jnp
 import networkx as nx
 import numpy as np
@@ -167,6 +169,9 @@ def test_an_infeasible_limit_is_an_error_with_the_safest_path(workspace):
         planner.plan(PARAMS)
     assert error.value.path == min(failure, key=failure.get)
     assert error.value.p_fail == pytest.approx(min(failure.values()), rel=1e-9)
+    copied = pickle.loads(pickle.dumps(error.value))  # as from a worker process
+    assert (str(copied), copied.path) == (str(error.value), error.value.path)
+    assert copied.p_fail == error.value.p_fail
     assert planner.evaluate(error.value.path, PARAMS).infeasible
     assert planner.maps(PARAMS.flat())["path_probability"].sum() == len(error.value.path)
     with pytest.raises(TrustboError, match="max_failure"):

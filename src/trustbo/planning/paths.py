@@ -24,7 +24,11 @@ A simple path contains no cell twice.
 STEPS = np.array(MOVES)
 """Row and column step of each move, shape (move, 2)."""
 _MOST_STATES = 20_000_000
-"""Maximum number of states of the unrolled graph; a graph of this size needs about 3 GB."""
+"""Maximum number of states of the graph to be searched.
+
+A graph of this size needs about 6 GB, or 17 GB with a risk, where each state also knows the
+bound that led to it.
+"""
 _MOST_EXTRA = 10_000
 """Maximum number of bounds beyond the fewest; longer walks would only go round in circles."""
 _SHORTEST = re.compile(r"shortest(?:\+(\d+))?")
@@ -156,12 +160,7 @@ class AdmissiblePaths:
         n_left = np.maximum(np.where(far == 0, 1, self.longest - near - far + 1), 0)
         n_left[(far < 0) | (near < 0)] = 0
         n_states = int(n_left.sum())
-        if n_states > _MOST_STATES:
-            raise TrustboError(
-                f"max_bounds = {self.max_bounds!r} (up to {self.longest} bounds) is too large: the "
-                f"search has {n_states:.3g} states, but at most {_MOST_STATES:.3g} are allowed. "
-                "Give a smaller max_bounds."
-            )
+        self._require_size(n_states)
 
         # List the states by cell, where the states of a cell begin at `base`, then sort by
         # `n_bounds_left`.
@@ -197,7 +196,17 @@ class AdmissiblePaths:
     @cached_property
     def paired(self) -> Paired:
         """Unrolled graph whose edges know the bound before them, for risks; see `graph`."""
+        self._require_size(len(self.graph.head))  # every edge leads to another of its states
         return paired(self.graph, self.bounds[0].size)
+
+    def _require_size(self, n_states: int) -> None:
+        """Raise TrustboError if a graph with this number of states is too large."""
+        if n_states > _MOST_STATES:
+            raise TrustboError(
+                f"max_bounds = {self.max_bounds!r} (up to {self.longest} bounds) is too large: the "
+                f"search has {n_states:.3g} states, but at most {_MOST_STATES:.3g} are allowed. "
+                "Give a smaller max_bounds."
+            )
 
     def avoiding(self, bounds: np.ndarray, risk: np.ndarray) -> "AdmissiblePaths":
         """Return the paths that avoid the given bounds.

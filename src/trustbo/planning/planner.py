@@ -96,7 +96,8 @@ class Planner(Summary):
             failure_cost: Cost of a failure in bounds, for lost_contact. The value is reduced by
                 this cost times the failure probability. The default is the smallest number of
                 bounds of a path, so a failed mission counts as a mission without contact.
-            family: Name of the trust model's observation family, used only for lost_contact.
+            family: Name of the trust model's observation family, used only for contact rates, as
+                in lost_contact. A posterior with trust on another scale is refused.
 
         Raises:
             TrustboError: If the start or goal is off the grid or impassable; the start equals the
@@ -273,6 +274,7 @@ class Planner(Summary):
                 workspace, or if beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
+        self.problem.require_family(params)
         with stopwatch() as elapsed:
             mean, draws = mean_and_draws_of(params, self.workspace)
             score, limits, paths = self.problem.best(self.problem.recursion(mean, x0))
@@ -311,6 +313,7 @@ class Planner(Summary):
             TrustboError: If any draw has beta0 outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
+        self.problem.require_family(posterior)
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
         recursion = self.problem.recursion(params)
         _, _, paths = self.problem.best(recursion)
@@ -334,6 +337,7 @@ class Planner(Summary):
             TrustboError: If the robots or features of the parameters differ from those of the
                 workspace, or if the path has gaps or does not lead from start to goal.
         """
+        self.problem.require_family(params)
         path = self.require_path(path)
         return self._evaluated(path, draws_of(params, self.workspace, next_mission=True), None, x0)
 
@@ -428,6 +432,7 @@ class Planner(Summary):
             TrustboError: If abs(beta0) >= 1, because trust would then grow without limit.
         """
         problem = self.problem
+        problem.require_family(params, uses_rates=True)
         recursion = problem.recursion(mean_of(params, self.workspace))
         radius = np.abs(np.linalg.eigvals(recursion.transition)).max()
         if radius >= 1.0:
@@ -508,6 +513,7 @@ class Planner(Summary):
         Example:
             >>> planner.trust(posterior, "r2", (3, 4)).quantile([0.05, 0.5, 0.95])
         """
+        self.problem.require_family(params, uses_rates=as_rate)
         draws = robot_draws_of(params, self.workspace)
         family = self.problem.likelihood
         return robot_trust(self.workspace, family, draws, robot, cell, move=move, as_rate=as_rate)
@@ -526,6 +532,7 @@ class Planner(Summary):
             variables are the mean `trust_mean` and standard deviation `trust_sd` of `trust`, and
             the mean `contact_rate` of `trust(as_rate=True)`. Cells that no bound enters are NaN.
         """
+        self.problem.require_family(posterior, uses_rates=True)
         draws = robot_draws_of(posterior, self.workspace)
         return robot_maps(self.workspace, self.problem.likelihood, draws)
 

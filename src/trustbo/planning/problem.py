@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, NoReturn, cast
+from typing import Any, NamedTuple, NoReturn, cast
 
 import numpy as np
 import xarray as xr
@@ -16,7 +16,7 @@ from trustbo.hazard.components import Components
 from trustbo.hazard.risk import ROUNDING, Risk
 from trustbo.inference.learner import expected_and_drawn, params_of
 from trustbo.models.draws import Draws
-from trustbo.models.families import Family
+from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import ParameterDraws
 from trustbo.planning.labels import LOGISTIC, LOSSES, TINY_SD, Costs, best_labels
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
@@ -52,6 +52,10 @@ class InfeasibleError(TrustboError):
         super().__init__(message)
         self.path = path
         self.p_fail = p_fail
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # By default, pickle would call the class with the message alone.
+        return type(self), (str(self), self.path, self.p_fail)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +109,31 @@ class Problem:
         if self.failure_cost is None:
             return float(self.paths.shortest)
         return self.failure_cost
+
+    def require_family(self, given: Draws | xr.DataTree, *, uses_rates: bool | None = None) -> None:
+        """Check that contact rates are computed from the trust of a posterior on the right scale.
+
+        Args:
+            given: Posterior, or parameters, whose family is not known.
+            uses_rates: Whether contact rates are computed; by default, whether the objective
+                measures contact.
+
+        Raises:
+            TrustboError: If trust is a logit in the posterior but not in the planner's family, or
+                the reverse.
+        """
+        if uses_rates is None:
+            uses_rates = self.objective.of_contact
+        if not uses_rates or not isinstance(given, xr.DataTree):
+            return
+
+        fitted = FAMILIES.get(str(given.attrs.get("family")), self.likelihood)
+        logits = [row.expected_rate == "logistic" for row in (fitted, self.likelihood)]
+        if logits[0] != logits[1]:
+            raise TrustboError(
+                f"the posterior has the family {fitted.name!r}, but the planner has the family "
+                f"{self.likelihood.name!r}; use Planner(..., family={fitted.name!r})."
+            )
 
     def bound_cost_along(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Sum the costs of the bounds of a path."""

@@ -51,6 +51,7 @@ def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None 
     """
     started = time.perf_counter()
     problem = planner.problem
+    problem.require_family(params)
     mean, draws = mean_and_draws_of(params, planner.workspace)
     recursion = capped(problem.objective, problem.likelihood, problem.recursion(mean, x0))
 
