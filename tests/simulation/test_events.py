@@ -115,6 +115,17 @@ def test_fouling_is_uniform_in_the_long_run_and_carries_over(wooded):
     np.testing.assert_allclose(mean, 0.6)
 
 
+def test_foulings_of_different_periods_multiply(wooded):
+    short, long = Fouling(0.2, every=3, seed=1), Fouling(0.5, every=5, seed=2)
+    plain = KinematicSimulator(wooded).world(1).detection
+    one, other = (KinematicSimulator(wooded, events=[e]).world(1).detection for e in (short, long))
+    assert (len(one), len(other)) == (3, 5)
+    for events in ((short, long), (long, short)):
+        both = KinematicSimulator(wooded, events=events).world(1).detection
+        last = np.minimum(np.arange(5), 2)  # the last row applies to all later bounds
+        np.testing.assert_allclose(both, one[last] * other / plain, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     "make",
     [

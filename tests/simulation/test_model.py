@@ -106,6 +106,18 @@ def test_impossible_settings_are_refused(workspace, options):
         ModelSimulator(workspace, PARAMS, **options)
 
 
+def test_simulators_with_other_measurements_are_described_differently(workspace):
+    counts = PooledTrust(family="beta_binomial")
+    few, many = (ModelSimulator(workspace, PARAMS, counts, n_ticks=n) for n in (10, 20))
+    assert few.describe() != many.describe()
+
+    awareness = workspace.awareness.values
+    plain = ModelSimulator(workspace, PARAMS)
+    other = ModelSimulator(workspace, PARAMS, awareness=0.5 * awareness)
+    assert plain.describe() != other.describe()
+    assert plain.describe() == ModelSimulator(workspace, PARAMS, awareness=awareness).describe()
+
+
 def test_a_model_has_no_table_of_bounds(workspace):
     with pytest.raises(TrustboError):
         Truth.from_simulator(ModelSimulator(workspace, PARAMS))

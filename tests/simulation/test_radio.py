@@ -76,6 +76,23 @@ def test_missions_are_seeded_and_the_field_is_drawn_from_the_terrain(radio):
     assert not np.allclose(RadioSimulator(radio.workspace, seed=1).mean, radio.mean)
 
 
+def test_a_true_terrain_is_read_like_other_terrains(radio):
+    terrain = radio.workspace.terrain
+    given = RadioSimulator(radio.workspace, terrain=terrain)
+    assert given.describe() == radio.describe()
+    np.testing.assert_array_equal(given.mean, radio.mean)
+
+    south_first = RadioSimulator(radio.workspace, terrain=terrain.sortby("y"))
+    np.testing.assert_array_equal(south_first.mean, radio.mean)
+
+    elsewhere = terrain.assign_coords(x=terrain["x"] + 1000.0)
+    with pytest.raises(TrustboError, match="covers"):
+        RadioSimulator(radio.workspace, terrain=elsewhere)
+    other_zone = terrain.rio.write_crs("EPSG:32617")
+    with pytest.raises(TrustboError, match="CRS"):
+        RadioSimulator(radio.workspace, terrain=other_zone)
+
+
 def test_a_workspace_without_terrain_is_refused():
     with pytest.raises(TrustboError):
         RadioSimulator(random_cells())

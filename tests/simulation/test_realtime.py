@@ -10,7 +10,7 @@ import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.simulation import KinematicSimulator, RealtimeAwareness
 from trustbo.simulation.realtime import MIN_SAMPLES, lidar_state
-from trustbo.team import Team
+from trustbo.team import Robot, Team
 from trustbo.workspace import Workspace
 
 PATHS = ([(2, 0), (1, 1), (0, 2)], [(0, 0), (1, 0), (1, 1)], [(2, 2), (1, 2), (0, 1)])
@@ -60,6 +60,21 @@ def test_on_open_ground_all_beams_are_clear(missions):
     return_range, visible = seen["return_range"], seen["visible_share"]
     np.testing.assert_allclose(visible, 1.0)
     np.testing.assert_allclose(return_range, 45.0)
+
+
+def test_each_robot_looks_as_far_as_its_own_lidar(simulator, missions):
+    near, far = Robot(lidar_range=20.0), Robot(lidar_range=40.0)
+    poses = missions[0].bounds[0].poses[:, 1:3]
+
+    def state(*robots):
+        world = simulator.world()._replace(team=Team(robots=robots))
+        return lidar_state(world, poses[:, : len(robots)])
+
+    mixed, short = state(near, far), state(near)
+    for name in ("return_range", "visible_share"):
+        np.testing.assert_array_equal(mixed[name][:, :1], short[name])
+        np.testing.assert_array_equal(mixed[name][:, 1], state(far, far)[name][:, 1])
+    assert (mixed["return_range"][:, 0] <= 20.0 + 1e-9).all()
 
 
 def test_few_missions_are_refused(simulator, missions):

@@ -99,7 +99,7 @@ def test_bounds_that_fail_say_so_and_keep_no_contact(wooded):
     assert found.lost(PATH) == found.lost_or_failed(PATH) == 3.0
 
 
-class Plain:
+class Undescribed:
     """Simulator of a user: contact .2 along rows, .8 otherwise; none if it goes on to the east."""
 
     def __init__(self, workspace):
@@ -113,8 +113,20 @@ class Plain:
         return Mission.from_arrays(path, np.full((n, 1, 2), np.nan), np.full((n, 1), rate))
 
 
+class Plain(Undescribed):
+    def describe(self):
+        return {"simulator": "plain"}
+
+
+def test_truths_of_unknown_settings_are_not_cached(tmp_path):
+    """Two such simulators would share a file, whatever their contact is."""
+    with pytest.raises(TrustboError, match="describe"):
+        Truth.from_simulator(Undescribed(grid((2, 2))), n_replicates=2, folder=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
 def test_any_simulator_has_a_truth():
-    found = Truth.from_simulator(Plain(grid((2, 3))), n_replicates=30)
+    found = Truth.from_simulator(Undescribed(grid((2, 3))), n_replicates=30)
     rates = contact_along(found, [(0, 0), (1, 0), (1, 1), (1, 2), (0, 2)])
     np.testing.assert_allclose(rates, [0.0, 0.0, 0.2, 0.8], atol=0.025)
 

@@ -249,7 +249,14 @@ class Fouling(Event):
         z: Any = lfilter([1.0], [1.0, -self.correlation], noise)
 
         factors = self.worst + (1.0 - self.worst) * ndtr(z[:, first:].T)  # (bound, robot)
-        return world._replace(detection=world.detection * factors)
+        n_bounds = max(len(factors), len(world.detection))
+        before = _up_to(n_bounds, world.detection)
+        return world._replace(detection=before * _up_to(n_bounds, factors))
+
+
+def _up_to(n_bounds: int, detection: np.ndarray) -> np.ndarray:
+    """Extend detection (bound, robot) to `n_bounds`; its last row applies to all later bounds."""
+    return detection[np.minimum(np.arange(n_bounds), len(detection) - 1)]
 
 
 def _require_circle(center: object, radius: object) -> None:

@@ -12,7 +12,7 @@ from trustbo.hazard.risk import read_risk
 from trustbo.models import PooledTrust
 from trustbo.models.draws import Draws
 from trustbo.models.model import TrustModel
-from trustbo.simulation.protocol import DescribedSimulator, require_path
+from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
 from trustbo.statespace import kalman
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
@@ -122,12 +122,16 @@ class ModelSimulator(DescribedSimulator):
         )
 
     def describe(self) -> dict[str, object]:
-        """Return the model and its true parameters."""
+        """Return the settings that affect the measurements of a mission."""
         about: dict[str, object] = {
             "simulator": type(self).__name__,
             "simulator_model": self.model.in_short(),
             "truth": self.params.record(),
         }
+        if self.n_ticks is not None:
+            about["n_ticks"] = self.n_ticks
+        if not np.array_equal(self.awareness, self.workspace.awareness.values, equal_nan=True):
+            about["true_awareness"] = digest(self.awareness)
         if self.p_fail is not None:
             about["p_fail"] = np.nan_to_num(self.p_fail, nan=-1.0).tolist()
         return about

@@ -13,6 +13,7 @@ from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
 from trustbo.simulation.replicates import table_of
+from trustbo.simulation.world import true_terrain
 from trustbo.terrain import pixel_size
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES, moves_along
@@ -60,14 +61,15 @@ class RadioSimulator(DescribedSimulator):
 
         Args:
             workspace: A workspace made from a terrain.
-            terrain: True DEM and DSM; by default the workspace's.
+            terrain: True DEM and DSM, which must cover the workspace; by default the workspace's.
             seed: Seed of the field and the radio qualities; by default a hash of the terrain.
 
         Raises:
-            TrustboError: The workspace has no terrain, and no other terrain is given.
+            TrustboError: The workspace has no terrain, and no other terrain is given; or the given
+                terrain does not cover the grid or has another CRS.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-        terrain = workspace.terrain if terrain is None else terrain
+        terrain = workspace.terrain if terrain is None else true_terrain(workspace, terrain)
         if terrain is None:
             raise TrustboError("the radio simulator needs a workspace made from a terrain.")
 

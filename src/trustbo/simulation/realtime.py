@@ -14,6 +14,7 @@ from trustbo.errors import TrustboError, require_kind, require_list, require_who
 from trustbo.simulation.kinematic import KinematicSimulator
 from trustbo.simulation.protocol import DescribedSimulator, digest
 from trustbo.simulation.world import World
+from trustbo.team import Robot
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace.moves import cells_ahead
 from trustbo.workspace.sight import detection_between, optics
@@ -65,7 +66,8 @@ class RealtimeAwareness(DescribedSimulator):
 
         Args:
             simulator: Simulator of the missions.
-            missions: Missions of this simulator, with poses; by default, missions on random paths.
+            missions: Missions of this simulator, with poses, in the world of mission 0; by default,
+                missions on random paths.
             seed: Seed of the random paths.
 
         Raises:
@@ -207,9 +209,16 @@ def _random_missions(simulator: KinematicSimulator, seed: int) -> list[Mission]:
 def lidar_state(world: World, poses: np.ndarray) -> dict[str, np.ndarray]:
     """Compute the mean range of returns (m) and the fraction of clear beams, (tick, robot).
 
-    The mean range is the integral over the range of the fraction of beams that reach it.
+    The mean range is the integral over the range of the fraction of beams that reach it. The poses
+    have shape (tick, robot, 3).
     """
-    robot = world.team.robots[0]
+    states = [_lidar_state(world, robot, poses[:, i]) for i, robot in enumerate(world.team.robots)]
+    ranges, shares = zip(*states, strict=True)
+    return {"return_range": np.stack(ranges, axis=1), "visible_share": np.stack(shares, axis=1)}
+
+
+def _lidar_state(world: World, robot: Robot, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the mean range of returns (m) and the fraction of clear beams of a robot, (tick,)."""
     low, high = np.reshape(world.surface.extent, (2, 2))
     reach = min(robot.lidar_range, 0.5 * float((high - low).min()))
     beams = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
@@ -219,6 +228,6 @@ def lidar_state(world: World, poses: np.ndarray) -> dict[str, np.ndarray]:
     lidar = optics(robot, world.team.lead)
     clear = detection_between(world.surface, world.sight, eye, target, lidar).mean(-1)
 
-    seen = np.insert(clear, 0, 1.0, axis=-1)  # (tick, robot, 1 + share)
+    seen = np.insert(clear, 0, 1.0, axis=-1)  # (tick, 1 + share)
     reached = np.asarray(np.trapezoid(seen, [0.0, *_SHARES], axis=-1))
-    return {"return_range": reach * reached, "visible_share": seen[..., -1]}
+    return reach * reached, seen[..., -1]

@@ -91,7 +91,7 @@ def _of_bounds(
     In replicate 0, which is not returned, the robots begin at their stop and posts.
     """
     world = simulator.world(mission, long_run=True)
-    ends: dict[tuple[Cell, Cell | None], dict[int, State]] = {}
+    ends: dict[tuple[Cell, Cell], dict[int, State]] = {}
     for number in range(n + 1):
         before = ends
         ends = {where: dict(states) for where, states in ends.items()}
@@ -112,7 +112,7 @@ def _of_bounds(
 
         for edge, outcomes in zip(edges, in_order(replicate, edges), strict=True):
             for next_cell, (_, status, after) in zip(edge.ahead, outcomes, strict=True):
-                if status == "ok":
+                if status == "ok" and next_cell is not None:
                     ends.setdefault((edge.cell, next_cell), {})[edge.move] = after
             if number:
                 yield edge, [(contact, status) for contact, status, _ in outcomes]

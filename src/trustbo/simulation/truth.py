@@ -80,10 +80,12 @@ class Truth(Summary):
             mission: Number of the mission, for simulators whose world changes.
             n_replicates: Number of replicates of every bound.
             seed: Seed of the replicates.
-            folder: Folder in which truths are cached; None for no cache.
+            folder: Folder in which truths are cached; None for no cache. The simulator then needs
+                the method `describe` or `describe_world`, because its settings name the file.
 
         Raises:
-            TrustboError: The simulator has no workspace, or its contact depends on earlier bounds.
+            TrustboError: The simulator has no workspace, its contact depends on earlier bounds, or
+                a cache is given but the settings of the simulator are unknown.
         """
         workspace = getattr(simulator, "workspace", None)
         if not isinstance(workspace, Workspace):
@@ -94,6 +96,13 @@ class Truth(Summary):
             raise TrustboError(
                 "in a ModelSimulator, the contact of a bound depends on all earlier bounds; use "
                 "Planner.evaluate(path, params) and Planner.plan(params) instead."
+            )
+
+        is_described = hasattr(simulator, "describe_world") or hasattr(simulator, "describe")
+        if folder is not None and not is_described:
+            raise TrustboError(
+                f"truths of {type(simulator).__name__} cannot be cached, because it has no method "
+                "describe() that returns its settings; add the method, or leave out folder=."
             )
 
         n_replicates = require_count("n_replicates", n_replicates)

@@ -7,6 +7,7 @@ import xarray as xr
 
 from trustbo.errors import TrustboError
 from trustbo.team import Team
+from trustbo.terrain import pixel_size
 from trustbo.terrain.read import require_terrain
 from trustbo.workspace import Workspace
 from trustbo.workspace.sight import Sight
@@ -37,33 +38,45 @@ def true_surface(workspace: Workspace, terrain: xr.Dataset | None) -> Surface:
     """Return the surface of the true terrain; by default, the surface of the workspace.
 
     Raises:
-        TrustboError: The terrain does not cover the grid or has another CRS, or the workspace has
-            no terrain.
+        TrustboError: The workspace has no terrain, or `true_terrain` refuses the true terrain.
     """
     planned = workspace.surface
-    if planned is None or workspace.terrain is None:
+    if planned is None:
         raise TrustboError(
             "the kinematic simulator needs a terrain; make the workspace with "
             "Workspace.from_terrain, or use another simulator."
         )
-    if terrain is None:
-        return planned
+    return planned if terrain is None else surface_of(true_terrain(workspace, terrain))
+
+
+def true_terrain(workspace: Workspace, terrain: xr.Dataset) -> xr.Dataset:
+    """Check the true terrain of a simulator and return it with north at the top.
+
+    Raises:
+        TrustboError: The terrain is not valid, does not cover the grid or has another CRS.
+    """
     terrain = require_terrain(terrain)
-    if terrain.rio.crs != workspace.terrain.rio.crs:
+    planned = workspace.terrain
+    if planned is not None and terrain.rio.crs != planned.rio.crs:
         raise TrustboError(
             f"the true terrain has the CRS {terrain.rio.crs}, but the workspace has the CRS "
-            f"{workspace.terrain.rio.crs}; reproject the terrain."
+            f"{planned.rio.crs}; reproject the terrain."
         )
 
-    surface = surface_of(terrain)
-    extent = surface.extent
-    needed = planned.extent
+    grid = workspace.grid
+    rows, cols = grid.shape
+    bottom = grid.top - rows * grid.cell_height
+    needed = grid.left, bottom, grid.left + cols * grid.cell_width, grid.top
+    pixel = max(pixel_size(terrain))
+    if workspace.surface is not None:
+        needed = workspace.surface.extent
+        pixel = max(pixel, *workspace.surface.pixel)
 
-    pixel = max(*surface.pixel, *planned.pixel)
+    extent = surface_of(terrain).extent
     short = max(*np.subtract(extent, needed)[:2], *np.subtract(needed, extent)[2:])
     if short > pixel:
         raise TrustboError(
             f"the true terrain ends {short:.3g} m inside the planning grid; give a terrain that "
             "covers the grid."
         )
-    return surface
+    return terrain
