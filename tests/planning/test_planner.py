@@ -11,6 +11,7 @@ from missions import counted_missions
 from scipy.special import expit
 
 from trustbo.errors import TrustboError
+from trustbo.hazard.components import Components
 from trustbo.inference import fit, params_of, sample_prior
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.models import PooledTrust, TrustParams
@@ -365,6 +366,19 @@ def test_logits_of_a_posterior_are_not_read_as_contact_rates():
     of_trust = Planner(workspace, (0, 0), (0, 5), "mean").plan(posterior)  # no rates
     assert of_trust.value == pytest.approx(right.trust.mean(), rel=1e-9)
     assert planner.trust(posterior, cell=(0, 3)).notnull().all()
+
+
+@pytest.mark.parametrize("weights", [[0.5], [1.0, 1.0], [np.nan, 1.0], [2.0, -1.0]])
+def test_weights_of_components_that_are_no_shares_are_refused(workspace, weights):
+    p = np.full((2, 8, 5, 6), 0.1)
+    with pytest.raises(TrustboError, match="weights"):
+        Planner(workspace, *ENDS).with_risk(p[0], None, Components(p, np.array(weights)))
+
+
+@pytest.mark.parametrize("n_driven", [-5, 2.5])
+def test_a_number_of_driven_bounds_is_whole_and_not_negative(workspace, n_driven):
+    with pytest.raises(TrustboError, match="n_driven"):
+        Planner(workspace, *ENDS, max_bounds=12).from_cell((3, 0), n_driven=n_driven)
 
 
 def test_costs_risks_and_starts_are_read_by_name(workspace):

@@ -69,6 +69,20 @@ def test_greedy_is_the_best_under_the_mean_and_thompson_under_single_draws(works
     assert len(drawn) > 3
 
 
+def test_thompson_plans_for_one_draw_of_any_chain(workspace):
+    planner, draws = Planner(workspace, *ENDS, "terminal"), prior_draws()
+    chains = draws.map(
+        lambda value, _: value.reshape(3, 20, *value.shape[1:]) if np.ndim(value) else value
+    )
+    assert chains.leading == (3, 20)
+    for seed in range(5):
+        expected = policies.thompson(rng(seed), draws, planner)
+        assert policies.thompson(rng(seed), chains, planner).path == expected.path
+
+    alone = policies.thompson(rng(), draws.draw(0), planner)
+    assert alone.path == planner.plan(draws.draw(0)).path
+
+
 def test_optimistic_is_drawn_to_cells_it_knows_nothing_of():
     """Corridors alike on average, of which one is uncertain."""
     passable = np.ones((3, 5), bool)
@@ -101,6 +115,8 @@ def test_explore_leaves_a_path_that_repeats_only_in_doubt(workspace):
     assert explored([best, best], doubt=0.999) == best
     for driven in ([], [best], [best, other], [best, other, best]):
         assert explored(driven) == best
+    for same in ([[list(cell) for cell in best]] * 2, [np.array(best)] * 2):
+        assert explored(same) == explored([best, best]) != best
 
 
 def test_random_paths_ignore_what_was_learned_and_keep_the_limit(workspace):

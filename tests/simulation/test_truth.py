@@ -99,6 +99,11 @@ def test_bounds_that_fail_say_so_and_keep_no_contact(wooded):
     assert found.lost(PATH) == found.lost_or_failed(PATH) == 3.0
 
 
+def test_a_time_limit_whose_ticks_exhaust_the_memory_is_refused(wooded):
+    with pytest.raises(TrustboError, match="bound_timeout"):
+        KinematicSimulator(wooded.workspace, bound_timeout=1e12)
+
+
 class Undescribed:
     """Simulator of a user: contact .2 along rows, .8 otherwise; none if it goes on to the east."""
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import OldName, Renamed, TrustboError, require_whole
+from trustbo.errors import OldName, Renamed, TrustboError, one_line, require_whole
 from trustbo.hazard.components import Components, partition
 from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, TILT, prior_betas, steepness_of
 from trustbo.workspace import Workspace
@@ -21,6 +21,8 @@ from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES, bounds_and_next
 
 ROUNDING = 1e-12
 """Tolerance for rounding errors when the risk of a path is compared with its limit."""
+_WEIGHT_ROUNDING = 1e-6
+"""Tolerance for rounding errors in the sum of the weights of components."""
 _BAND = (0.05, 0.95)
 """Quantile levels of the ends of `p_arrive_band`."""
 _ENTRIES = 1 << 20
@@ -301,7 +303,8 @@ class Risk(Summary):
             of a path. If None, bounds are assumed to fail independently with probability `p_fail`.
 
     Raises:
-        TrustboError: If the shapes do not match, or a probability is outside [0, 1].
+        TrustboError: If the shapes do not match, a probability is outside [0, 1], or the weights of
+            the components do not sum to 1.
     """
 
     p_fail: np.ndarray
@@ -321,6 +324,15 @@ class Risk(Summary):
             bad = (p < 0.0) | (p > 1.0)
             if bad.any():
                 raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")
+
+        if self.components is not None:
+            groups, weights = self.components
+            is_share = weights.shape == (len(groups),) and (weights >= 0.0).all()
+            if not is_share or abs(weights.sum() - 1.0) > _WEIGHT_ROUNDING:
+                raise TrustboError(
+                    f"components need {len(groups)} nonnegative weights with the sum 1; got "
+                    f"{one_line(weights)}."
+                )
 
     def _rows(self) -> Rows:
         n_draws = 0 if self.draws is None else len(self.draws)

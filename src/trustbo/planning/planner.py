@@ -19,6 +19,7 @@ from trustbo.errors import (
     require_bounds,
     require_choice,
     require_positive,
+    require_whole,
 )
 from trustbo.hazard.components import Components
 from trustbo.hazard.risk import Risk, read_risk
@@ -193,6 +194,7 @@ class Planner(Summary):
                 closed[*bounds_along(there_and_back).T] = True
 
         max_bounds = paths.max_bounds
+        n_driven = require_whole("n_driven", n_driven, 0)
         if not isinstance(max_bounds, str):
             rest = AdmissiblePaths(paths.workspace, cell, self.goal, "shortest", blocked=closed)
             max_bounds = max(max_bounds - n_driven, rest.shortest)
@@ -237,7 +239,8 @@ class Planner(Summary):
                 of failure. By default, bounds fail independently with probability `p_fail`.
 
         Raises:
-            TrustboError: If the shapes do not match, or a probability is outside [0, 1].
+            TrustboError: If the shapes do not match, a probability is outside [0, 1], or the
+                weights of the components do not sum to 1.
         """
         mean = read_risk("p_fail", p_fail)
         drawn = None if draws is None else read_risk("draws", draws, ("draw",))

@@ -12,7 +12,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from trustbo.data import Cell
-from trustbo.errors import require_choice, require_finite, require_kind, require_share
+from trustbo.errors import (
+    require_cells,
+    require_choice,
+    require_finite,
+    require_kind,
+    require_share,
+)
 from trustbo.models.draws import Draws
 from trustbo.planning.draws import DrawnPaths, choose_draws
 from trustbo.planning.plan import Plan
@@ -50,7 +56,8 @@ def thompson(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
         >>> plan = tb.planning.policies.thompson(rng, params, planner)
     """
     _require(rng, params, planner)
-    plan = planner.plan(params.draw(int(rng.integers(params.leading[0]))))
+    draws = params.flat()
+    plan = planner.plan(draws.draw(int(rng.integers(draws.leading[0]))))
     return planner.evaluate(plan.path, params.mean())
 
 
@@ -127,7 +134,7 @@ def explore(
     require_share("regret", regret)
     require_share("doubt", doubt)
 
-    last = [tuple(path) for path in driven[-_N_REPEATED:]]
+    last = [require_cells("a path in driven", path) for path in driven[-_N_REPEATED:]]
     if last != [plan.path] * _N_REPEATED:
         return plan
 

@@ -19,6 +19,8 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.posts import Posts
 from trustbo.workspace.sight import Sight
 
+_MOST_TICKS = 1_000_000
+"""Largest number of ticks of a bound; wheel slip is drawn in advance for every tick."""
 _LEAD = slice(0, 1)
 """Index of the lead in arrays with the lead first."""
 _T2 = slice(1, None)
@@ -76,12 +78,14 @@ class KinematicSimulator(DescribedSimulator):
             sight: True model of sight; by default the workspace's.
             team: True team, with the same names; by default the workspace's.
             tick: Length of a tick, in seconds.
-            bound_timeout: Time limit of a bound, in s; a longer bound ends the mission ("timeout").
+            bound_timeout: Time limit of a bound, in s, at most a million ticks; a longer bound ends
+                the mission ("timeout").
             events: Changes of the world in given missions, such as `Jam` or `Dust`.
 
         Raises:
             TrustboError: The workspace has no terrain, the team's names differ, a value is not
-                positive, or an event does not fit the terrain or the team.
+                positive, `bound_timeout` is too long, or an event does not fit the terrain or the
+                team.
         """
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.workspace = workspace
@@ -97,6 +101,11 @@ class KinematicSimulator(DescribedSimulator):
         surface = true_surface(workspace, terrain)
         self.tick = require_positive("tick", tick)
         self.bound_timeout = require_positive("bound_timeout", bound_timeout)
+        if self.bound_timeout / self.tick > _MOST_TICKS:
+            raise TrustboError(
+                f"bound_timeout = {self.bound_timeout:g} s is too long: a bound can take at most "
+                f"{_MOST_TICKS} ticks of {self.tick:g} s."
+            )
         self._max_ticks = round(self.bound_timeout / self.tick)
         self.events = tuple(require_list("events", events, Event, "give events such as Jam(...)"))
 
