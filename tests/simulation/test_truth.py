@@ -10,6 +10,7 @@ from worlds import contact_along, hillside, random_cells
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
+from trustbo.planning import NoPathError
 from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.simulation.replicates import edges_of, table_of
 from trustbo.team import Robot, Team
@@ -134,6 +135,26 @@ def test_any_simulator_has_a_truth():
     found = Truth.from_simulator(Undescribed(grid((2, 3))), n_replicates=30)
     rates = contact_along(found, [(0, 0), (1, 0), (1, 1), (1, 2), (0, 2)])
     np.testing.assert_allclose(rates, [0.0, 0.0, 0.2, 0.8], atol=0.025)
+
+
+class Partial(Undescribed):
+    """Simulator of two robots, of which it often measures one and sometimes none."""
+
+    def run(self, path, *, seed, mission=0):
+        rates = super().run(path, seed=seed, mission=mission).contact_rate[:, [0, 0]]
+        rates[0, : seed % 3] = np.nan
+        return Mission.from_arrays(path, np.full((*rates.shape, 2), np.nan), rates)
+
+
+def test_rates_that_are_not_measured_are_left_out_of_the_truth():
+    found = Truth.from_simulator(Partial(grid((2, 3))), n_replicates=30)
+    rates = contact_along(found, [(0, 0), (1, 0), (1, 1), (1, 2), (0, 2)])
+    np.testing.assert_allclose(rates, [0.0, 0.0, 0.2, 0.8], atol=0.03)
+    assert len(found.best((0, 0), (0, 2))) > 2
+
+    unknown = np.full((8, 2, 3, 9), np.nan)
+    with pytest.raises(NoPathError):
+        Truth(grid((2, 3)), table_of(unknown, unknown)).best((0, 0), (0, 2))
 
 
 def test_a_truth_is_found_once_and_read_from_its_file_again(tmp_path, monkeypatch):

@@ -158,11 +158,11 @@ def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
     for name in ("positions", "trust", "bands"):
         values[name] = np.array(record[name])
 
-    if record.get("value_band"):
+    if record["value_band"]:
         values["value_band"] = tuple(record["value_band"])
     if record["risk"]:
         values["risk"] = PathRisk.from_record(record["risk"])
 
-    values["blocked"] = tuple(((a, b), (c, d)) for (a, b), (c, d) in record.get("blocked", ()))
+    values["blocked"] = tuple(((a, b), (c, d)) for (a, b), (c, d) in record["blocked"])
     values["path"] = tuple((row, col) for row, col in record["path"])
     return Plan(**values)

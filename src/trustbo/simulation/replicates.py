@@ -28,7 +28,10 @@ class Edge(NamedTuple):
 
 
 type Outcomes = Iterator[tuple[Edge, list[tuple[float, str]]]]
-"""Bounds, each with the mean contact over robots and the status for each next move."""
+"""Bounds, each with the mean contact over robots and the status for each next move.
+
+The contact is NaN if it was not measured.
+"""
 
 
 def table_of(contact: np.ndarray, passed: np.ndarray) -> xr.Dataset:
@@ -66,6 +69,7 @@ def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr
     shape = END, *workspace.passable.shape, END + 1
     total = np.zeros(shape)
     n_passed = np.zeros(shape)
+    n_measured = np.zeros(shape)
     n = np.zeros(shape)
     replicates = _of_bounds if isinstance(simulator, KinematicSimulator) else _of_missions
 
@@ -76,10 +80,13 @@ def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr
             n[where] += 1.0
             if status == "ok":
                 n_passed[where] += 1.0
-                total[where] += contact
+                if np.isfinite(contact):
+                    n_measured[where] += 1.0
+                    total[where] += contact
 
+    always_failed = (n > 0.0) & (n_passed == 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        contact = np.where(n_passed > 0.0, total / n_passed, np.where(n > 0.0, 0.0, np.nan))
+        contact = np.where(always_failed, 0.0, total / n_measured)
         return table_of(contact, n_passed / n)
 
 
@@ -133,5 +140,7 @@ def _of_missions(
                 entropy = [seed, number, edge.move, *edge.cell, i]
                 drawn = int(np.random.SeedSequence(entropy).generate_state(1)[0])
                 bound = simulator.run(tuple(path), seed=drawn, mission=mission).bounds[0]
-                outcomes.append((float(np.mean(bound.contact_rate)), bound.status))
+                measured = bound.contact_rate[np.isfinite(bound.contact_rate)]
+                contact = float(measured.mean()) if len(measured) else np.nan
+                outcomes.append((contact, bound.status))
             yield edge, outcomes

@@ -17,7 +17,7 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import OldName, TrustboError, require_count, require_whole
 from trustbo.files import FilePath, to_json, to_path, write_file
 from trustbo.models.backend import VERSIONS
-from trustbo.planning.paths import AdmissiblePaths
+from trustbo.planning.paths import AdmissiblePaths, NoPathError
 from trustbo.simulation.model import ModelSimulator
 from trustbo.simulation.protocol import digest, require_path
 from trustbo.simulation.replicates import replicated
@@ -33,8 +33,8 @@ class Truth(Summary):
         workspace: Workspace of the simulator.
         bounds: Dataset with the dims (move, row, col, next_move); the last next move is "end".
             `contact` is the mean over robots of the expected contact rate if the bound does not
-            fail, or 0 if it failed in all replicates. `passed` is the probability that the bound
-            does not fail. Both are NaN where there is no bound.
+            fail, or 0 if it failed in all replicates, and NaN if it was not measured. `passed` is
+            the probability that the bound does not fail. Both are NaN where there is no bound.
 
     Example:
         >>> simulator = tb.simulation.RadioSimulator(workspace)
@@ -166,7 +166,7 @@ class Truth(Summary):
 
         Raises:
             TrustboError: A cell is off the grid or impassable, or `max_bounds` is too small.
-            NoPathError: The goal cannot be reached.
+            NoPathError: The goal cannot be reached, or the contact of all paths is unknown.
         """
         paths = AdmissiblePaths(self.workspace, start, goal, max_bounds)
         contact = self.bounds["contact"].values
@@ -252,6 +252,12 @@ def _most_kept(
         choices.append(kept.argmax(-1))
         value = kept.max(-1)
         value[:, *goal] = -np.inf  # a path ends at the goal
+
+    if not np.isfinite(most).any():
+        raise NoPathError(
+            f"the truth has no contact for any path from {start} to {goal}: the simulator did not "
+            "measure the bounds."
+        )
 
     # Choose the number of bounds that loses least, and follow the choices from the start.
     n = int(np.argmin(np.arange(1, longest + 1) - np.array(most)))
