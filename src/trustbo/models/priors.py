@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cache, partial
-from typing import Any
+from functools import partial
+from threading import Lock
+from typing import Any, SupportsIndex
 
 import numpy as np
 import numpyro.distributions as dist
@@ -31,6 +32,11 @@ _FEATURE_SD = 0.25
 _INTERCEPT_SD = 0.15
 _MIDDLE = 0.5
 """Contact rate that `Priors.for_cells` expects in every cell, the middle of [0, 1]."""
+
+
+_LOCK = Lock()
+_DEFAULTS: dict[str, "Priors"] = {}
+"""The objects that `Priors.default` returns, by family."""
 
 
 def _built(kind: Any, *parameters: float) -> Distribution:
@@ -104,14 +110,26 @@ class Priors(Summary):
             object.__setattr__(self, name, number)
 
     @classmethod
-    @cache
     def default(cls, family: str) -> "Priors":
         """Return the default priors for an observation family; each call returns the same object.
+
+        A model with this object uses the priors of `from_features`, so the object is the same in
+        all threads and copies.
 
         The family `"beta_binomial"` has wider priors because trust is a logit: beta_m ~ N(0, 2^2),
         b ~ N(0, 1), delta_w ~ HalfNormal(0.5) and x_0 ~ N(0, 1.5^2).
         """
-        return cls(**FAMILIES[family].priors())
+        with _LOCK:
+            if family not in _DEFAULTS:
+                _DEFAULTS[family] = cls(**FAMILIES[family].priors())
+            return _DEFAULTS[family]
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
+        """Copy and unpickle default priors as the same object; see `default`."""
+        for family in FAMILIES:
+            if self is _DEFAULTS.get(family):
+                return Priors.default, (family,)
+        return super().__reduce_ex__(protocol)
 
     of = OldName("from_features")
 
