@@ -87,3 +87,15 @@ def test_the_density_is_the_same_in_jax(name):
     with own_settings():
         found = ALL[name].log_prob(y, np.full(3, N), jax.numpy.asarray(f), 0.1)
     np.testing.assert_allclose(found, numpy, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("y", [0.0, 0.5, 1.0])
+def test_the_derivatives_in_jax_are_differences_of_the_density(name, y):
+    at = np.array([0.7, 0.15])  # predictor and sd
+    with own_settings():
+        found = jax.grad(lambda x: ALL[name].log_prob(jax.numpy.asarray(y), N, x[0], x[1]))(at)
+
+    step = 1e-5 * np.eye(2)
+    high, low = (ALL[name].log_prob(np.array(y), np.array(N), *x.T) for x in (at + step, at - step))
+    np.testing.assert_allclose(found, (high - low) / 2e-5, rtol=1e-5, atol=1e-6)

@@ -54,9 +54,14 @@ class Levels(Family):
         mirror = low > 0.0
         low, high = xp.where(mirror, -high, low), xp.where(mirror, -low, high)
 
+        def p_below(end: Array, of_one: float) -> Array:
+            is_infinite = xp.isinf(end)  # JAX has no derivative of such an end divided by sd
+            p = ndtr(xp.where(is_infinite, 0.0, end) / (of_one * sd))
+            return xp.where(is_infinite, end > 0.0, p)
+
         total = 0.0
         for share, of_one in zip(_SHARES, _SDS, strict=True):
-            total = total + share * (ndtr(high / (of_one * sd)) - ndtr(low / (of_one * sd)))
+            total = total + share * (p_below(high, of_one) - p_below(low, of_one))
         return xp.log(xp.maximum(total, _LEAST_P))
 
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
