@@ -10,6 +10,7 @@ import pytest
 from dense_statespace import form_of, mission_of
 from numpyro import handlers
 from scipy.linalg import block_diag
+from scipy.stats import multivariate_normal
 from unit_noise import UnitNoise
 
 from trustbo.errors import TrustboError
@@ -56,6 +57,31 @@ def test_the_density_is_that_of_the_joint_normal(of_beta0, of_delta_w, of_delta_
         law, dense = law_of(of_beta0, of_delta_w, of_delta_v, delta_s)
         found = law.log_prob(RATES)
     expected = [one.log_density(y) for one, y in zip(dense, RATES, strict=True)]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("delta_s", [None, 0.3])
+@pytest.mark.parametrize(("beta0", "x0_sd"), [(0.0, 0.5), (0.6, 0.0)])
+def test_rates_of_a_known_trust_are_those_of_a_regression(beta0, x0_sd, delta_s):
+    """Without process noise, trust is known, and only the noise of rates is left."""
+    trust = np.zeros(DRIFT.shape)
+    before = 0.5
+    for k in range(DRIFT.shape[1]):
+        before = trust[:, k] = beta0 * before + DRIFT[:, k]
+
+    with own_settings():
+        law = ContactRate(DRIFT, beta0, 0.0, 0.1, 0.5, x0_sd, delta_s=delta_s)
+        found = law.log_prob(RATES)
+
+    cov = 0.1**2 * np.eye(N_ROBOTS) + (delta_s or 0.0) ** 2
+    expected = [
+        sum(
+            multivariate_normal(x[seen], cov[np.ix_(seen, seen)]).logpdf(y[seen])
+            for x, y in zip(trust[j], RATES[j], strict=True)
+            if (seen := ~np.isnan(y)).any()
+        )
+        for j in range(len(RATES))
+    ]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
@@ -137,3 +163,6 @@ def test_rates_and_parameters_must_have_the_shape_of_the_drift():
         law.log_prob(np.zeros((2, 3, 4)))
     with pytest.raises(TrustboError, match="beta0"):
         ContactRate(rates, np.full(4, 0.5), 0.1, 0.1)
+    for beta0 in (0.5, np.eye(3)):
+        with pytest.raises(TrustboError, match="delta_s"):
+            ContactRate(rates, beta0, 0.1, 0.1, delta_s=np.full(3, 0.1))

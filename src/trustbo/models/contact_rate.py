@@ -117,6 +117,9 @@ class ContactRate(dist.Distribution):
                     f"got {np.shape(value)}."
                 )
 
+        if delta_s is not None and np.size(delta_s) != 1:
+            raise TrustboError(f"delta_s must be one number; got the shape {np.shape(delta_s)}.")
+
         matrices = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v}
         values = {name: _checked(name, v, n_robots, True) for name, v in matrices.items()}
         x0 = {"x0_mean": x0_mean, "x0_sd": x0_sd}
@@ -268,7 +271,7 @@ def _coupled(
 
     noise = matrix("delta_v", squared=True)
     if delta_s is not None:
-        noise = noise + jnp.asarray(delta_s, float) ** 2
+        noise = noise + jnp.reshape(jnp.asarray(delta_s, float), ()) ** 2
     return coupled_robots(
         matrix("beta0", squared=False)[None],
         matrix("delta_w", squared=True)[None],

@@ -125,11 +125,13 @@ def condition(
     Returns:
         The mean (..., n) and covariance (..., n, n) given the rate, and its log mass (...,).
     """
+    xp = namespace(mean)
     m = mean[..., k]
     v = cov[..., k, k]
     log_mass, m_after, v_after = likelihood.moment_match(rate, n_ticks, m, v, sd)
 
-    gain = cov[..., k] / v[..., None]
+    # A known predictor, with v = 0 and hence no covariance with the others, has no gain.
+    gain = cov[..., k] / xp.where(v > 0.0, v, 1.0)[..., None]
     mean = mean + gain * (m_after - m)[..., None]
     cov = cov - gain[..., :, None] * gain[..., None, :] * (v - v_after)[..., None, None]
     return mean, cov, log_mass
