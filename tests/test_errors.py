@@ -76,7 +76,7 @@ MISTAKES = {
     "sight as text": (lambda w: tb.workspace.Sight(crown_base="0.3"), "crown_base"),
     "extinction below 0": (lambda w: tb.workspace.Sight(extinction=-0.1), "extinction"),
     "one number for a mean and an sd": (lambda w: tb.hazard.Hazard(margin=0.5), "margin"),
-    "no effects": (lambda w: PooledTrust(effects=None), "effects"),
+    "no effects": (lambda w: PooledTrust(effects=None), "effects.*PlaceEffect"),
     "an unknown family": (lambda w: Priors.from_features(("a",), family="x"), "family"),
     "a model as text": (lambda w: tb.inference.sample_prior("x", 2, 5, 0), "model"),
     "a quantile as text": (

@@ -107,7 +107,7 @@ def require_positive(what: str, value: Any, *, or_zero: bool = False) -> float:
     number = _number(value)
     if not 0.0 <= number < math.inf or (number == 0.0 and not or_zero):
         least = "0 or more, and" if or_zero else "positive and"
-        raise TrustboError(f"{what} must be {least} finite; got {value!r}.")
+        raise TrustboError(f"{what} must be {least} finite; got {one_line(value)}.")
     return number
 
 
@@ -186,7 +186,7 @@ def require_list(what: str, value: Any, kind: Any = object, remedy: str = "") ->
         entries = None
 
     if entries is None:
-        raise TrustboError(f"{what} must be a list; got {one_line(value)}. {advice.capitalize()}.")
+        raise TrustboError(f"{what} must be a list; got {one_line(value)}; {advice}.")
     return [require_kind(f"{what}[{k}]", entry, kind, advice) for k, entry in enumerate(entries)]
 
 
@@ -209,7 +209,9 @@ def require_pair(what: str, value: object) -> tuple[int, int]:
     try:
         first, second = (operator.index(i) for i in value)  # pyright: ignore[reportGeneralTypeIssues]
     except (TypeError, ValueError):
-        raise TrustboError(f"{what} must be two whole numbers (row, col); got {value!r}.") from None
+        raise TrustboError(
+            f"{what} must be two whole numbers (row, col); got {one_line(value)}."
+        ) from None
     return first, second
 
 

@@ -9,7 +9,7 @@ import numpyro.distributions as dist
 
 from trustbo.data import levels_of
 from trustbo.display import Rows
-from trustbo.errors import Renamed, TrustboError, require_positive
+from trustbo.errors import Renamed, TrustboError, require_choice, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Theta
 from trustbo.models.families import FAMILIES, Family, Levels
@@ -53,7 +53,8 @@ class HumanTrust(PooledTrust):
         tau_gain: Scale of the half-normal prior on the standard deviation of personal gains.
 
     Raises:
-        TrustboError: If the scale is unknown, a tau is not positive, or an effect is given.
+        TrustboError: If the scale is unknown, a tau is not positive, an effect is given, or the
+            family or the memory is changed.
 
     Example:
         >>> people = tb.logs.read_reports("answers.csv", outcome="outcome", scale="likert7")
@@ -61,6 +62,7 @@ class HumanTrust(PooledTrust):
         >>> posterior["posterior"]["beta"].mean(("chain", "draw"))  # after success and failure
     """
 
+    family: str = "censored"  # only on the unit scale; see `likelihood`
     memory: str = "deviation"
     scale: str = "unit"
     tau_start: float = 0.3
@@ -69,7 +71,8 @@ class HumanTrust(PooledTrust):
 
     def __post_init__(self) -> None:
         levels_of(self.scale)
-        object.__setattr__(self, "family", "censored")  # only on the unit scale; see `likelihood`
+        require_choice("HumanTrust.family", self.family, ["censored"])
+        require_choice("HumanTrust.memory", self.memory, ["deviation"])
         if self.priors is None:
             object.__setattr__(self, "priors", _default_priors())
         super().__post_init__()

@@ -8,7 +8,7 @@ from typing import Any, SupportsIndex
 
 import numpy as np
 import numpyro.distributions as dist
-from numpyro.distributions import Distribution, constraints
+from numpyro.distributions import Distribution
 
 from trustbo.data import is_line_of_sight
 from trustbo.display import Rows, Summary
@@ -99,7 +99,8 @@ class Priors(Summary):
         for name in (one.name for one in fields(self) if one.type is Distribution):
             prior = getattr(self, name)
             if wanted := _wanted(name, prior):
-                raise TrustboError(f"the prior Priors.{name} must be {wanted}; got {prior!r}.")
+                got = as_text(prior) if isinstance(prior, Distribution) else repr(prior)
+                raise TrustboError(f"the prior Priors.{name} must be {wanted}; got {got}.")
 
         numbers = {
             "concentration": require_positive("Priors.concentration", self.concentration),
@@ -192,7 +193,16 @@ class Priors(Summary):
         return np.asarray(prior.loc, dtype=float), np.asarray(prior.scale, dtype=float)
 
     def coefficients(self, n_features: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the prior means and sds (feature + 1,) of the weights and, last, the intercept."""
+        """Return the prior means and sds (feature + 1,) of the weights and, last, the intercept.
+
+        Raises TrustboError if `beta` has priors for another number of features.
+        """
+        shape = self.beta.batch_shape
+        if shape not in ((), (n_features,)):
+            raise TrustboError(
+                f"Priors.beta has priors for {shape[0]} features, but there are {n_features}."
+            )
+
         pairs = zip(self.moments("beta"), self.moments("b"), strict=True)
         mean, sd = (np.append(np.broadcast_to(beta, n_features), b) for beta, b in pairs)
         return mean, sd
@@ -230,7 +240,8 @@ def _wanted(name: str, prior: Any) -> str:
             f"model; {see('howto/your-own-model')})"
         )
     elif name == "beta0":
-        good = prior.support is constraints.unit_interval
+        low, high = (getattr(prior.support, f"{end}_bound", np.nan) for end in ("lower", "upper"))
+        good = bool(np.all(low >= 0.0) and np.all(high <= 1.0))
         wanted = "on (0, 1), e.g. Beta(2.0, 2.0)"
     else:
         good = np.all(np.asarray(getattr(prior.support, "lower_bound", -np.inf)) >= 0.0)
@@ -246,8 +257,12 @@ def as_text(prior: Distribution | float) -> str:
     if not isinstance(prior, Distribution):
         return f"{prior:g}"
 
-    numbers = ", ".join(f"{n}={_numbers(getattr(prior, n))}" for n in type(prior).arg_constraints)
-    return f"{type(prior).__name__}({numbers})"
+    parts = [f"{n}={_numbers(getattr(prior, n))}" for n in type(prior).arg_constraints]
+    is_determined = parts and isinstance(prior, dist.TransformedDistribution)  # e.g. LogNormal
+    base = getattr(prior, "base_dist", None)
+    if base is not None and not is_determined:  # e.g. of a truncated distribution
+        parts.insert(0, as_text(base))
+    return f"{type(prior).__name__}({', '.join(parts)})"
 
 
 def _numbers(values: object) -> str:
