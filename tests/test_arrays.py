@@ -189,3 +189,13 @@ def test_names_are_different_texts(names):
     with pytest.raises(TrustboError, match="names"):
         as_names("names", names)
     assert as_names("names", np.array(["a", "b"])) == ("a", "b")
+
+
+def test_reversed_columns_without_names_are_refused():
+    table = pd.DataFrame([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+    names = {"robot": ("r1", "r2", "r3")}
+    np.testing.assert_array_equal(
+        read_labelled("x", table, ("bound", "robot"), names).values, table
+    )
+    with pytest.raises(TrustboError, match="robot"):
+        read_labelled("x", table.iloc[:, ::-1], ("bound", "robot"), names)

@@ -263,3 +263,52 @@ def test_numbers_of_numpy_become_python_s():
 def test_names_of_a_team_are_texts(names):
     with pytest.raises(TrustboError, match="names"):
         Team(3, names=names)
+
+
+def test_a_mission_keeps_its_data_when_the_arrays_of_a_log_are_used_again():
+    z, y = arrays()
+    duration = np.full(y.shape, 20.0)
+    mission = Mission.from_arrays(PATH, z, y, duration)
+    expected = Mission.from_arrays(PATH, z.copy(), y.copy(), duration.copy())
+    for array in (z, y, duration):
+        array[...] = 0.25
+    assert mission.has_same_data(expected)
+    np.testing.assert_array_equal(mission.bounds[0].duration, 20.0)
+
+
+def test_lists_of_cells_and_bounds_are_the_same_mission_as_tuples():
+    """A mission that is told again must be recognised."""
+    mission = Mission.from_arrays(PATH, *arrays())
+    listed = Mission([list(cell) for cell in mission.path], list(mission.bounds))
+    assert listed.has_same_data(mission)
+    assert listed.path == mission.path
+    assert isinstance(listed.bounds, tuple)
+
+
+def test_a_failure_in_the_last_bound_is_not_lost():
+    z, y = arrays()
+    bounds = Mission.from_arrays(PATH, z, y, status="stuck").bounds
+    with pytest.raises(TrustboError, match="stuck"):
+        Mission(PATH, bounds)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("duration", [np.inf, 1.0]),
+        ("n_ticks", [np.inf, 2.0]),
+        ("poses", np.zeros((5, 2, 3))),  # without the lead
+        ("contact", np.zeros((5, 3), bool)),
+        ("t0", np.nan),
+        ("cell", (0.5, 1)),
+    ],
+)
+def test_what_is_no_measurement_of_a_bound_is_refused(name, values):
+    given = {"cell": (0, 1), "duration": np.ones(2)} | {name: values}
+    with pytest.raises(TrustboError, match=name):
+        Bound(awareness=np.full((2, 2), 0.5), contact_rate=np.full(2, 0.5), **given)
+
+
+def test_a_log_without_bounds_is_refused():
+    with pytest.raises(TrustboError, match="at least one bound"):
+        Mission.from_arrays(PATH, np.zeros((0, 2, 2)), np.zeros((0, 2)))

@@ -221,7 +221,7 @@ def _as_dataarray(
     for dim, index in axes.items():
         if dim in _FIRST and index.name != dim:
             _require_in_order(what, dim, index)
-        elif not isinstance(index, pd.RangeIndex):
+        elif not (isinstance(index, pd.RangeIndex) and index.step > 0):
             coords[dim] = index.to_numpy()
     return xr.DataArray(_with_nan(values), coords, tuple(axes))
 

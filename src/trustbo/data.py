@@ -12,7 +12,15 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import as_names, default_robots, read_labelled, without_rounding
 from trustbo.display import Rows, Summary, joined
-from trustbo.errors import TrustboError, require_cells, require_choice, require_kind, require_whole
+from trustbo.errors import (
+    TrustboError,
+    require_cells,
+    require_choice,
+    require_finite,
+    require_kind,
+    require_pair,
+    require_whole,
+)
 
 Cell = tuple[int, int]
 STATUSES = ("ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted")
@@ -32,6 +40,8 @@ LINE_OF_SIGHT = "line_of_sight"
 class Bound:
     """Measurements of one bound, one row per overwatching robot.
 
+    The measurements are copied, so the given arrays may be used again.
+
     Attributes:
         cell: Planning cell entered, (row, col); `NOWHERE` in a log without a map.
         awareness: Situational awareness, shape (robot, feature), in [0, 1], or any finite values in
@@ -48,8 +58,8 @@ class Bound:
 
     Raises:
         TrustboError: The arrays disagree on the number of robots, a value is outside [0, 1], a
-            duration is not positive, n_ticks is not a positive whole number, a rate is not a
-            multiple of 1 / n_ticks, or the status is unknown.
+            duration is infinite or not positive, n_ticks is not a positive whole number, a rate is
+            not a multiple of 1 / n_ticks, or the status is unknown.
 
     Example:
         >>> bound = mission.bounds[0]
@@ -69,6 +79,8 @@ class Bound:
     n_ticks: np.ndarray = None  # pyright: ignore[reportAssignmentType]
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "cell", require_pair("the cell of a bound", self.cell))
+        object.__setattr__(self, "t0", require_finite("t0 of a bound", self.t0))
         object.__setattr__(self, "awareness", _unnamed("awareness", self.awareness))
         if self.awareness.ndim != 2 or not self.awareness.size:
             raise TrustboError(
@@ -85,6 +97,13 @@ class Bound:
             shape = getattr(self, name).shape
             if shape != per_robot:
                 raise TrustboError(f"{name} of a bound must be {per_robot}; got shape {shape}.")
+
+        n_robots = len(self.awareness)
+        for name, per_tick in {"poses": (1 + n_robots, 3), "contact": (n_robots,)}.items():
+            shape = np.shape(getattr(self, name))
+            if getattr(self, name) is not None and shape[1:] != per_tick:
+                wanted = ("tick", *per_tick)
+                raise TrustboError(f"{name} of a bound must be {wanted}; got shape {shape}.")
         require_choice("status", self.status, STATUSES)
 
         mapped = self.cell != NOWHERE
@@ -97,10 +116,12 @@ class Bound:
         elif np.isinf(self.awareness).any():
             raise TrustboError(f"awareness of {where} must be finite, or NaN where not measured.")
 
-        is_bad = self.duration <= 0.0
+        is_bad = (self.duration <= 0.0) | np.isinf(self.duration)
         if is_bad.any():
             i = np.flatnonzero(is_bad)[0]
-            raise TrustboError(f"duration[{i}] = {self.duration[i]:g} s must be positive.")
+            raise TrustboError(
+                f"duration[{i}] = {self.duration[i]:g} s must be positive and finite."
+            )
 
         ticks = require_shares(self.contact_rate, self.n_ticks)
         object.__setattr__(self, "n_ticks", ticks)
@@ -138,8 +159,8 @@ class Mission(Summary):
             that are fitted together. Places on different maps have independent effects.
 
     Raises:
-        TrustboError: The bounds do not fit the path, or disagree on robots or features, or the
-            status or the scale is unknown.
+        TrustboError: The bounds do not fit the path, or disagree on robots or features, the last
+            bound failed although the status is "ok", or the status or the scale is unknown.
 
     Example:
         >>> rates = np.array([[0.9, 1.0], [0.4, 0.8]])  # (bound, robot)
@@ -160,29 +181,12 @@ class Mission(Summary):
     def __post_init__(self) -> None:
         require_choice("status", self.status, STATUSES)
         require_kind("path", self.path, Sequence, "give the cells in a tuple; () without a map")
+        object.__setattr__(self, "path", require_cells("path", self.path))
         for bound in require_kind("bounds", self.bounds, Sequence, "give the bounds in a tuple"):
             require_kind("bounds", bound, Bound, "give a tuple of Bound")
+        object.__setattr__(self, "bounds", tuple(self.bounds))
 
-        n_run = len(self.bounds)
-        n_planned = len(self.path) - 1
-        if not n_run or (self.path and n_run > n_planned):
-            most = f" and at most {n_planned} on its path" if self.path else ""
-            raise TrustboError(
-                f"a mission has at least one bound{most}; got {n_run}. If no bound was run, use "
-                "`Campaign.fail`."
-            )
-        if self.status == "ok" and n_run < n_planned:
-            raise TrustboError(
-                f'status "ok" means that the goal was reached, but only {n_run} of {n_planned} '
-                "bounds were run; give the status of the last one."
-            )
-
-        _require_counted(self.path)
-        for k, bound in enumerate(self.bounds, start=1):
-            expected = self.path[k] if self.path else NOWHERE
-            if bound.cell != expected:
-                there = "there is no path" if expected == NOWHERE else f"the path has {expected}"
-                raise TrustboError(f"bound {k} enters {bound.cell}, but {there}.")
+        self._require_fit()
 
         shapes = {bound.awareness.shape for bound in self.bounds}
         if len(shapes) > 1:
@@ -201,6 +205,34 @@ class Mission(Summary):
 
         if not isinstance(self.scale, str) or self.scale:
             levels_of(self.scale)
+
+    def _require_fit(self) -> None:
+        """Raise TrustboError unless the bounds and the status fit the path."""
+        n_run = len(self.bounds)
+        n_planned = len(self.path) - 1
+        if not n_run or (self.path and n_run > n_planned):
+            most = f" and at most {n_planned} on its path" if self.path else ""
+            raise TrustboError(
+                f"a mission has at least one bound{most}; got {n_run}. If no bound was run, use "
+                "`Campaign.fail`."
+            )
+        if self.status == "ok" and n_run < n_planned:
+            raise TrustboError(
+                f'status "ok" means that the goal was reached, but only {n_run} of {n_planned} '
+                "bounds were run; give the status of the last one."
+            )
+        if self.status == "ok" and self.bounds[-1].status != "ok":
+            raise TrustboError(
+                'status "ok" means that the goal was reached, but the status of the last bound is '
+                f"{self.bounds[-1].status!r}; give this status to the mission."
+            )
+
+        _require_counted(self.path)
+        for k, bound in enumerate(self.bounds, start=1):
+            expected = self.path[k] if self.path else NOWHERE
+            if bound.cell != expected:
+                there = "there is no path" if expected == NOWHERE else f"the path has {expected}"
+                raise TrustboError(f"bound {k} enters {bound.cell}, but {there}.")
 
     def _rows(self) -> Rows:
         rates = self.contact_rate
@@ -263,10 +295,10 @@ class Mission(Summary):
         names = {"robot": as_names("robots", robots), "feature": as_names("features", features)}
         z = _read(names, "awareness", awareness, ("bound", "robot", "feature"))
         y = _read(names, "contact_rate", contact_rate, ("bound", "robot"))
-        if z.ndim != 3 or y.shape != z.shape[:2]:
+        if z.ndim != 3 or y.shape != z.shape[:2] or not len(y):
             raise TrustboError(
-                "awareness must be (bound, robot, feature) and contact_rate (bound, robot); "
-                f"got {z.shape} and {y.shape}."
+                "awareness must be (bound, robot, feature) and contact_rate (bound, robot), with "
+                f"at least one bound; got {z.shape} and {y.shape}."
             )
 
         known = names["robot"] or default_robots(y.shape[1])
@@ -355,8 +387,8 @@ class Mission(Summary):
     def with_robots(self, robots: Sequence[str]) -> Self:
         """Return the mission with these robots, which include its own; added robots have no rates.
 
-        The awareness of added robots is 0, which has no influence because they have no rates. Ticks
-        are left out.
+        The awareness of added robots is 0, which has no influence because they have no rates. Poses
+        and contact at each tick are left out.
         """
         if tuple(robots) == self.robots:
             return self
@@ -472,7 +504,8 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> np.ndarray:
         raise TrustboError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
 
     ticks = np.where((ticks == 0.0) & np.isnan(rate), np.nan, ticks)
-    is_bad = (ticks < 1.0) | (ticks != np.round(ticks)) & ~np.isnan(ticks)
+    is_whole = np.isfinite(ticks) & (ticks == np.round(ticks))
+    is_bad = ~np.isnan(ticks) & ~(is_whole & (ticks >= 1.0))
     if is_bad.any():
         i = np.flatnonzero(is_bad)[0]
         raise TrustboError(f"n_ticks[{i}] = {ticks[i]:g} must be a whole number of ticks.")
@@ -510,9 +543,9 @@ def _require_counted(path: Iterable[Cell]) -> None:
 
 
 def _unnamed(what: str, values: Any) -> np.ndarray:
-    """Read an array of a bound, whose robots and features have no names."""
+    """Copy an array of a bound, whose robots and features have no names."""
     dims = ("robot", "feature") if what == "awareness" else ("robot",)
-    return read_labelled(f"{what} of a bound", values, dims, dict.fromkeys(dims)).values
+    return np.array(read_labelled(f"{what} of a bound", values, dims, dict.fromkeys(dims)).values)
 
 
 def _read(
