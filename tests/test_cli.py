@@ -87,6 +87,12 @@ def test_info_describes_and_draws_the_grid(rasters, tmp_path, capsys):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+def test_info_refuses_an_unknown_format_of_the_figure(rasters, tmp_path, capsys):
+    files = rasters / "dem.tif", rasters / "dsm.tif"
+    assert call("info", *files, "--shape", "3,3", "--out", tmp_path / "grid.xyz") == 2
+    assert "xyz" in capsys.readouterr().err
+
+
 def test_info_states_the_slope_limit_and_the_cells_that_are_passable_with_it(
     rasters, tmp_path, capsys
 ):

@@ -179,7 +179,10 @@ def info(args: argparse.Namespace) -> None:
     print(_passable(workspace))
     plt.switch_backend("agg")
     tb.plots.grid_map(workspace)
-    plt.savefig(args.out, dpi=150)
+    try:
+        plt.savefig(args.out, dpi=150)
+    except ValueError as error:  # a format that Matplotlib does not know
+        raise TrustboError(f"--out: {error}.") from None
     print(f"the figure of the grid is in {args.out}")
 
 
