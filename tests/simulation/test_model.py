@@ -134,3 +134,13 @@ def test_true_awareness_and_probabilities_are_read_by_name(workspace):
     np.testing.assert_array_equal(simulator.p_fail, np.repeat(p.values[..., None], 9, axis=-1))
     with pytest.raises(TrustboError, match="awareness"):
         ModelSimulator(workspace, PARAMS, awareness=truth.assign_coords(feature=["a", "b"]))
+
+
+def test_the_description_tells_kinds_of_memory_apart(workspace):
+    simulators = [
+        ModelSimulator(workspace, PARAMS._replace(memory=memory), model=PooledTrust(memory=memory))
+        for memory in ("level", "deviation")
+    ]
+    level, deviation = (simulator.describe()["truth"] for simulator in simulators)
+    assert level != deviation
+    assert TrustParams(**deviation).memory == "deviation"

@@ -26,7 +26,7 @@ from trustbo.parallel import computing
 SIZE = 0.1
 """Smallest effect on contact that is considered large enough to change a plan."""
 SURE = 0.95
-"""Probability above which such an effect is reported."""
+"""Probability above which such an effect, or the sign of an effect, is reported."""
 _PAIR = 2
 """Number of robots for which robots are compared with each other instead of with their median."""
 _SIGNED = 0.6
@@ -49,9 +49,10 @@ class Check(Summary):
             it `stands_out`, the most affected `label`, and the `size` and `probability` of the
             effect.
         robots: One row per `mission` (counted from 1) and `robot`. The columns are the `effect`
-            (share of line of sight minus the median), its `sd`, the `probability` that its absolute
-            value exceeds .1, and `stands_out`. With two robots, the effect is the difference from
-            the other robot in the same mission, so the two rows of a mission have opposite signs.
+            (share of line of sight minus the median), its `sd`, the `probability` that it is below
+            -.1 or above .1, whichever is larger, and `stands_out`. With two robots, the effect is
+            the difference from the other robot in the same mission, so the two rows of a mission
+            have opposite signs.
     """
 
     verdict: str
@@ -94,11 +95,12 @@ def check(
     missions by more than .1 of line of sight, with a probability above .95. With two robots, the
     median lies halfway between them, so the difference between the robots is tested instead.
 
-    A place stands out if its effect differs from the median over the visited places by more than .1
-    of contact, with a probability above .95. The median is subtracted because a shift that most
-    places share cannot be distinguished from the intercept. A weight stands out if its sign
-    contradicts its prior. The coverage of 90 % intervals one mission ahead stands out if it differs
-    from .9 by more than .05 and two standard errors over missions.
+    A place stands out if the mean of its effect differs from the median over the visited places by
+    more than .1 of contact, and the sign of the difference has a probability above .95. The median
+    is subtracted because a shift that most places share cannot be distinguished from the intercept.
+    A weight stands out if its sign contradicts its prior. The coverage of 90 % intervals one
+    mission ahead stands out if it differs from .9 by more than .05 and two standard errors over
+    missions.
 
     See also `pit` of `tb.inference.score` for the shape of predictions, `tb.compare` for other
     models, and `az.psense_summary(posterior)` for the sensitivity to the priors.

@@ -91,7 +91,7 @@ class Draws(ABC):
 
     @abstractmethod
     def record(self) -> dict[str, Any]:
-        """Return a description of the draws for files, as plain numbers keyed by name."""
+        """Return a description of the draws for files, as plain values keyed by name."""
 
     def team_inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
         """Compute the mean of `inputs` over robots, with the axis (robot,) of length 1."""

@@ -220,8 +220,11 @@ class ParameterDraws(Summary, Draws):
         return self._replace(place_robot=change(self.place_robot))  # pyright: ignore[reportAttributeAccessIssue]
 
     def record(self) -> dict[str, Any]:
-        """See `Draws.record`."""
-        return {name: np.asarray(value).tolist() for name, value in self.by_name.items()}
+        """See `Draws.record`; effects of robots in bounds are left out."""
+        record: dict[str, Any] = {n: np.asarray(v).tolist() for n, v in self.by_name.items()}
+        if not self.carried:
+            record["memory"] = "deviation"
+        return record
 
     def map(self, function: Callable[[Numbers, int], Numbers]) -> Self:
         """Apply `function(field, number of trailing axes)` to every field."""
