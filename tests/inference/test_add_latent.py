@@ -7,8 +7,10 @@ import xarray as xr
 from missions import simulate_missions
 from numpyro.distributions import HalfCauchy
 
+from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import add_latent, fit, sample_prior
+from trustbo.inference.tree import parameters_alone
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors
 
 
@@ -43,6 +45,22 @@ def test_it_adds_what_fit_adds_at_once(missions, model, tmp_path):
     xr.testing.assert_identical(
         add_latent(alone, missions)["latent"].to_dataset(), whole["latent"].to_dataset()
     )
+
+
+def test_missions_may_have_their_features_in_another_order():
+    """The default priors depend on the names of the features."""
+    features = ("traversability", "line_of_sight")
+    missions = [
+        Mission.from_arrays(one.path, one.awareness, one.contact_rate, features=features)
+        for one in simulate_missions(3)
+    ]
+    turned = [one.in_order(one.robots, features[::-1], ()) for one in missions]
+    whole = fit(missions, PooledTrust(), draws=25)
+    alone = parameters_alone(whole)
+    for group in ("log_likelihood", "log_prior", "latent"):
+        xr.testing.assert_identical(
+            add_latent(alone, turned)[group].to_dataset(), whole[group].to_dataset()
+        )
 
 
 def test_the_caller_s_jax_flags_do_not_matter(missions):

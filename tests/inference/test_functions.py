@@ -18,13 +18,14 @@ from numpyro.infer.util import constrain_fn, log_density, potential_energy
 from scipy import stats
 
 import trustbo as tb
-from trustbo.errors import PosteriorError
+from trustbo.errors import PosteriorError, TrustboError
 from trustbo.inference import params_of
 from trustbo.inference.functions.data import data_of
 from trustbo.inference.functions.fit import _judge as judge
 from trustbo.inference.functions.function import as_model, model_of_record
 from trustbo.inference.functions.identity import constants_of, fingerprint
 from trustbo.inference.functions.nuts import Samples
+from trustbo.inference.tree import parameters_alone
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.backend import own_settings
 from trustbo.models.observations import Observations
@@ -249,6 +250,39 @@ def by_mission(awareness, contact_rate=None):
         off = numpyro.sample("off", dist.Normal(0.0, 0.05))
         rates = ContactRate(level + off[:, None, None] + 0.0 * awareness[..., 0], 0.4, 0.05, 0.05)
         numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+def test_a_function_of_one_robot_and_one_feature_is_read_from_a_file(tmp_path):
+    def level(awareness, contact_rate=None):
+        drift = awareness[..., 0] * numpyro.sample("level", dist.Normal(0.0, 0.5))
+        with numpyro.plate("mission", len(awareness)):
+            numpyro.sample("contact_rate", ContactRate(drift, 0.4, 0.05, 0.05), obs=contact_rate)
+
+    awareness = np.random.default_rng(0).uniform(size=(1, 5, 5, 1))
+    workspace = tb.Workspace.from_awareness(awareness, features=("traversability",))
+    path = [(4, k) for k in range(5)]
+    mission = tb.Mission.from_arrays(
+        path, np.full((4, 1, 1), 0.5), np.full((4, 1), 0.7), features=workspace.features
+    )
+    fitted = tb.fit([mission], level, draws=50, latent=False, check=False, progress=False)
+    file = tmp_path / "posterior.nc"
+    fitted.to_netcdf(file)
+    with xr.open_datatree(file) as read:
+        draws = params_of(read.load(), workspace)
+    assert (draws.robots, draws.features) == (("r1",), ("traversability",))
+
+
+def test_missions_in_another_order_are_put_in_that_of_the_posterior(posterior, missions):
+    """A function reads robots and features by position, so another order is another drift."""
+    turned = [one.in_order(one.robots[::-1], one.features[::-1], ()) for one in missions]
+    alone = parameters_alone(posterior)
+    later = tb.inference.add_latent(alone, turned)["log_likelihood"].to_dataset()
+    np.testing.assert_array_equal(
+        later["contact_rate"], posterior["log_likelihood"].to_dataset()["contact_rate"]
+    )
+    for tree in (posterior, alone):
+        with pytest.raises(TrustboError, match="robots"):
+            tb.inference.score(tree, turned)
 
 
 def test_variables_of_one_mission_are_drawn_for_the_next(missions, workspace):

@@ -223,6 +223,9 @@ def _robot_effects_ahead(
 
 def names_in(posterior: xr.DataTree, axis: str) -> tuple[str, ...]:
     """Return the names of the robots or features of a posterior; empty if it has none."""
+    if f"{axis}s" in posterior.attrs:  # of a function; a file stores a single name as a text
+        return tuple(np.atleast_1d(posterior.attrs[f"{axis}s"]).tolist())
+
     for group in ("posterior", "robots", "constant_data"):
         if group in posterior.children and axis in posterior[group].coords:
             return tuple(str(name) for name in posterior[group].coords[axis].values)
@@ -236,8 +239,13 @@ def in_order_of(
 
     Parameters that all robots share apply to robots with any names. Robots that occur only in
     missions of earlier campaigns (attribute `other_robots`) are left out, unless they are in
-    `robots`. Raises TrustboError if names differ.
+    `robots`. Raises TrustboError if names differ or, for a posterior of a function, are in another
+    order.
     """
+    if is_by_position(posterior):
+        require_same_order(posterior, robots, features)
+        return posterior
+
     others = np.atleast_1d(posterior.attrs.get("other_robots", [])).tolist()
     if others and not set(others) <= set(robots):
         posterior = _without_robots(posterior, [name for name in others if name not in robots])
@@ -284,6 +292,25 @@ def _without_robots(posterior: xr.DataTree, others: Sequence[str]) -> xr.DataTre
     return kept
 
 
+def is_by_position(posterior: xr.DataTree) -> bool:
+    """Return whether a posterior is of a function, which identifies robots by their position."""
+    return "robots" in posterior.attrs
+
+
+def require_same_order(
+    posterior: xr.DataTree, robots: Sequence[str], features: Sequence[str]
+) -> None:
+    """Raise TrustboError if a posterior of a function has other names, or another order of them."""
+    for axis, names in {"robot": tuple(robots), "feature": tuple(features)}.items():
+        have = names_in(posterior, axis)
+        if have != names:
+            raise TrustboError(
+                f"the function {posterior.attrs['model']} was fitted to missions with the "
+                f"{axis}s {', '.join(have)}, not {', '.join(names)}. A function reads them by "
+                "position, so give the same names in the same order."
+            )
+
+
 def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
     """Return the effects in the model of a posterior; a function has none."""
     return effects_from_record(json.loads(posterior.attrs["model_record"]))
@@ -321,14 +348,15 @@ def read_posterior(
 
     Args:
         posterior: DataTree from `fit`.
-        missions: Fitted missions; needed if the posterior contains no data.
+        missions: Fitted missions, with the features in the order of the posterior; needed if the
+            posterior contains no data.
         model: Model of the posterior; needed if the priors are custom.
 
     Raises:
         TrustboError: If the posterior contains no data and no missions are given, or a custom model
             is not given.
     """
-    missions = missions_of(posterior) if missions is None else list(missions)
+    missions = missions_of(posterior) if missions is None else missions
     require_same_team(missions)
     features = missions[0].features
     posterior = in_order_of(posterior, missions[0].robots, features)
@@ -342,6 +370,20 @@ def read_posterior(
     groups = {"posterior": parameters_of(posterior)}
     groups |= {effect.group: values_of(posterior, effect) for effect in model.effects}
     return fitted, draws_of(fitted, groups)
+
+
+def in_order_of_features(missions: Sequence[Mission], posterior: xr.DataTree) -> list[Mission]:
+    """Return missions with their features in the order of a posterior.
+
+    The order of the robots changes only for a posterior of a function. Raises TrustboError if the
+    missions disagree or their names differ from those of the posterior.
+    """
+    require_same_team(missions)
+    features = names_in(posterior, "feature") or missions[0].features
+    robots = missions[0].robots
+    if is_by_position(posterior):
+        robots = names_in(posterior, "robot")
+    return [mission.in_order(robots, features, ()) for mission in missions]
 
 
 def sample_prior(

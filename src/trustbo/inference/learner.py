@@ -14,6 +14,7 @@ from trustbo.data import Mission
 from trustbo.errors import Renamed, TrustboError, require_kind, see
 from trustbo.inference.draws import (
     expected_and_drawn_of_model,
+    in_order_of_features,
     missions_of,
     params_of_model,
     prior_mean,
@@ -444,6 +445,7 @@ def add_latent(
         return posterior
 
     missions = missions_of(posterior) if missions is None else missions
+    missions = in_order_of_features(missions, posterior)
     learner = learner_of_posterior(posterior, model)
     if isinstance(learner, FunctionLearner):
         return with_latent_of_function(posterior, missions, learner.model, progress=progress)

@@ -13,7 +13,7 @@ from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, require_kind, warn
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of
-from trustbo.inference.draws import joined_draws
+from trustbo.inference.draws import joined_draws, names_in, require_same_order
 from trustbo.inference.functions.data import (
     RATES,
     Data,
@@ -321,19 +321,12 @@ def draws_of_function(
         TrustboError: If the workspace has different robots or features, or the same in a different
             order.
     """
-    robots = tuple(posterior.attrs["robots"])
-    features = tuple(posterior.attrs["features"])
+    robots = names_in(posterior, "robot")
+    features = names_in(posterior, "feature")
     shape: Any = None
     if workspace is not None:
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-        has = {"robots": workspace.team.names, "features": workspace.features}
-        for what, names in {"robots": robots, "features": features}.items():
-            if tuple(has[what]) != names:
-                raise TrustboError(
-                    f"{model.in_short()} was fitted to missions with the {what} "
-                    f"{', '.join(names)}; the workspace has {', '.join(has[what])}. A function "
-                    "reads them by place, so give the same ones in the same order."
-                )
+        require_same_order(posterior, workspace.team.names, workspace.features)
         shape = workspace.passable.shape
 
     draws = posterior["posterior"].to_dataset()
