@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import xarray as xr
 from missions import simulate_missions
-from numpyro.distributions import HalfCauchy
+from numpyro.distributions import HalfCauchy, Normal
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.inference import add_latent, fit, sample_prior
+from trustbo.inference import add_latent, fit, loo, sample_prior
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors
 
@@ -61,6 +61,21 @@ def test_missions_may_have_their_features_in_another_order():
         xr.testing.assert_identical(
             add_latent(alone, turned)[group].to_dataset(), whole[group].to_dataset()
         )
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        PooledTrust(Priors(b=Normal(0.0, 0.7)), memory="deviation"),
+        PooledTrust(Priors(b=Normal(3.0, 0.1))),
+        HierarchicalTrust(),
+    ],
+)
+def test_another_model_than_that_of_the_posterior_is_refused(missions, other):
+    posterior = fit(missions, PooledTrust(Priors(b=Normal(0.0, 0.7))), draws=25, latent=False)
+    for evaluate in (add_latent, loo):
+        with pytest.raises(TrustboError):
+            evaluate(posterior, model=other)
 
 
 def test_the_caller_s_jax_flags_do_not_matter(missions):

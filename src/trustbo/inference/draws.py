@@ -353,18 +353,19 @@ def read_posterior(
         model: Model of the posterior; needed if the priors are custom.
 
     Raises:
-        TrustboError: If the posterior contains no data and no missions are given, or a custom model
-            is not given.
+        TrustboError: If the posterior contains no data and no missions are given, a custom model is
+            not given, or a different model is given.
     """
     missions = missions_of(posterior) if missions is None else missions
     require_same_team(missions)
     features = missions[0].features
     posterior = in_order_of(posterior, missions[0].robots, features)
 
-    if model is None:
-        model = model_from_record(json.loads(posterior.attrs["model_record"]), features=features)
-    require_kind("model", model, TrustModel, "give the model of the posterior")
-    model = model.for_features(features)
+    if model is not None:
+        require_kind("model", model, TrustModel, "give the model of the posterior")
+        model = model.for_features(features)
+    record = json.loads(posterior.attrs["model_record"])
+    model = model_from_record(record, model, features).for_features(features)
 
     fitted = Density(model, model.observations(missions))
     groups = {"posterior": parameters_of(posterior)}
