@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from dense_coefficients import DenseRates
 from dense_statespace import log_density
-from missions import simulate_missions
+from missions import counted_missions, simulate_missions
 from scipy import special, stats
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import compare, fit, loo
-from trustbo.inference.loo import good_khat
+from trustbo.inference.loo import good_khat, left_out
 from trustbo.models import HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.observations import Observations
 from trustbo.workspace.moves import bounds_along
@@ -131,6 +131,16 @@ def test_every_model_is_left_out_as_its_evidence_says(model):
     expected = posterior.attrs["log_evidence"] - rest.attrs["log_evidence"]
     # Two evidences, of some 200 effective points each.
     assert float(result.elpd_i[-1]) == pytest.approx(expected, abs=0.5)
+
+
+def test_a_refit_does_not_change_the_densities_of_other_missions():
+    """A fit moves the EP sites from which the evidence of non-Gaussian rates is computed."""
+    _, _, missions = counted_missions("beta_binomial")
+    posterior = fit(missions, PooledTrust(family="beta_binomial"), draws=50, progress=False)
+    target = left_out("loo", posterior)
+    before = target.log_density(4)
+    target.refit(0)
+    np.testing.assert_array_equal(target.log_density(4), before)
 
 
 @of_few_missions

@@ -241,8 +241,8 @@ def _of_class(posterior: xr.DataTree, model: Model | None) -> LeftOut:
 
     def refit(j: int) -> tuple[float, float]:
         """Compute p(y_j | y_-j) = p(y) / p(y_-j), with a separate fit for each factor."""
-        if not known:
-            known.append(_log_evidence(fitted, seed)[0])
+        if not known:  # in a copy, because the fit changes the EP sites that `log_density` uses
+            known.append(_log_evidence(Density(fitted.model, fitted.observations), seed)[0])
         rest, k_hat = _log_evidence(fitted.without(j), seed)
         return known[0] - rest + float(shift[j]), k_hat
 
