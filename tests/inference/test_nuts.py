@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.nuts import Whitened
 
 
@@ -37,3 +38,11 @@ def test_points_are_less_skewed_and_uncorrelated_in_these_coordinates(scores, co
     x = coordinates.whiten(scores)
     assert abs(stats.skew(x)).max() < 0.3 * abs(stats.skew(scores)).max()
     np.testing.assert_allclose(np.cov(x.T), np.eye(3), atol=1e-4)
+
+
+def test_a_single_chain_that_never_moved_fails_both_checks():
+    stuck = {"weight": np.full((1, 100, 2), 0.3)}
+    found, complaints = complaints_of(stuck, np.zeros((1, 100), bool))
+    assert np.isnan(found["r_hat"])
+    assert np.isnan(found["ess_bulk"])
+    assert len(complaints) == 2

@@ -49,13 +49,16 @@ def complaints_of(
 
     # Parameters that are constant in the model have no diagnostics.
     free = {name: v[:, :, np.ptp(v, axis=(0, 1)) > 0.0] for name, v in flat.items()}
-    tree = arviz_base.from_dict({"posterior": {n: v for n, v in free.items() if v.size}})
-    parameters = tree["posterior"].to_dataset()
+    free = {name: v for name, v in free.items() if v.size}
 
-    r_hat = sampling_diagnostics.rhat(parameters)
-    ess = sampling_diagnostics.ess(parameters, method="bulk")
-    worst = max(float(values.max()) for values in r_hat.data_vars.values())
-    least = min(float(values.min()) for values in ess.data_vars.values())
+    worst = np.nan
+    least = np.nan
+    if free:  # otherwise, a single chain has not moved at all
+        parameters = arviz_base.from_dict({"posterior": free})["posterior"].to_dataset()
+        r_hat = sampling_diagnostics.rhat(parameters)
+        ess = sampling_diagnostics.ess(parameters, method="bulk")
+        worst = max(float(values.max()) for values in r_hat.data_vars.values())
+        least = min(float(values.min()) for values in ess.data_vars.values())
     divergences = int(diverging.sum())
 
     complaints = []
