@@ -285,6 +285,27 @@ def test_missions_in_another_order_are_put_in_that_of_the_posterior(posterior, m
             tb.inference.score(tree, turned)
 
 
+def test_a_start_with_other_variables_is_ignored(missions):
+    def weights(awareness, contact_rate=None):
+        n_features = awareness.shape[-1]
+        weight = numpyro.sample("weight", dist.Normal(0.0, 0.5).expand([n_features]).to_event(1))
+        with numpyro.plate("mission", len(awareness)):
+            rates = ContactRate(awareness @ weight, 0.4, 0.05, 0.05)
+            numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    one_feature = [
+        tb.Mission.from_arrays(one.path, one.awareness[..., :1], one.contact_rate)
+        for one in missions
+    ]
+    options = {"draws": 50, "latent": False, "check": False, "progress": False}
+    start = tb.fit(one_feature, weights, **options)
+    cold = tb.fit(missions, weights, **options)
+    xr.testing.assert_identical(
+        tb.fit(missions, weights, start=start, **options)["posterior"].to_dataset(),
+        cold["posterior"].to_dataset(),
+    )
+
+
 def test_variables_of_one_mission_are_drawn_for_the_next(missions, workspace):
     fitted = tb.fit(
         missions, by_mission, workspace=workspace, draws=500, check=False, progress=False
@@ -410,6 +431,11 @@ def discrete(awareness, rates):
     numpyro.sample("contact_rate", ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1), obs=rates)
 
 
+def same_names(awareness, rates):
+    drift = numpyro.sample("a/b", dist.Normal()) + numpyro.sample("a.b", dist.Normal())
+    numpyro.sample("contact_rate", ContactRate(drift + awareness[..., 0], 0.4, 0.1, 0.1), obs=rates)
+
+
 def named_draw(awareness, rates):
     a = numpyro.sample("draw", dist.Normal())
     numpyro.sample("contact_rate", ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1), obs=rates)
@@ -459,6 +485,7 @@ def broken(awareness, rates):
         (refused(independent), "has the distribution Normal"),
         (refused(unobserved), "is not observed; pass obs=contact_rate"),
         (refused(named_draw), "has the name of an axis"),
+        (refused(same_names), "the sites 'a/b' and 'a.b'"),
         (refused(discrete), "the site 'a' .* is discrete"),
         (refused(with_parameter), "the site 'b' .* is a parameter .* use numpyro.sample"),
         (refused(improper), "failed with NotImplementedError: .* proper priors"),

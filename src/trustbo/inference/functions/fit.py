@@ -34,7 +34,7 @@ from trustbo.inference.functions.nuts import (
     joined_samples,
     warm_start,
 )
-from trustbo.inference.functions.sites import Site
+from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.tree import N_PRIOR, kept_draws, to_datatree
 from trustbo.models.backend import library_attrs, own_settings
 from trustbo.models.families import FAMILIES
@@ -567,7 +567,11 @@ def _start(
     chains: int,
     seed: int,
 ) -> Start:
-    """Return the starts of the chains, which are draws of a previous posterior of the function."""
+    """Return the starts of the chains, which are draws of a previous posterior of the function.
+
+    If the previous posterior has other variables, or a variable has an axis of missions, the starts
+    are random.
+    """
     with own_settings():
         free = free_shapes(model, sites, data)
     n = sum(values.size for values in free.values())
@@ -575,9 +579,11 @@ def _start(
         return cold_start(n, chains, seed)
 
     draws = previous["posterior"].to_dataset()
-    values = {name: joined_draws(draws[safe(name)]) for name in sites}
-    if any(site.mission_axis is not None for site in sites.values()):
-        return cold_start(n, chains, seed)
+    values = {name: joined_draws(draws[safe(name)]) for name in sites if safe(name) in draws}
+    for name, site in sites.items():
+        is_same = name in values and values[name].shape[1:] == site.shape
+        if site.mission_axis is not None or not is_same:
+            return cold_start(n, chains, seed)
 
     z = model.over_draws("unconstrain", 1, data)(values)
     x = coordinates_of({name: array[None] for name, array in z.items()})
@@ -590,11 +596,6 @@ def _keys(n: int, seed: int) -> Any:
     """Return n random keys."""
     with own_settings():
         return jax.random.split(jax.random.key(seed), n)
-
-
-def safe(name: str) -> str:
-    """Return the name of a variable in a DataTree, in which "/" separates groups."""
-    return name.replace("/", ".")
 
 
 def _without_padding(values: np.ndarray, site: Site, n_missions: int) -> np.ndarray:

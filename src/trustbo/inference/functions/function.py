@@ -34,6 +34,7 @@ from trustbo.inference.functions.sites import (
     has_prior,
     latent_in,
     plates_of_rates,
+    safe,
     site_of,
 )
 from trustbo.models.backend import own_settings
@@ -299,6 +300,7 @@ class FunctionModel:
 
     def _require_variables(self, trace: Mapping[str, Any]) -> None:
         """Raise TrustboError for sites whose kind or name is not allowed in a posterior."""
+        taken: dict[str, str] = {}
         for name, one in trace.items():
             free = one["type"] == "sample" and not one["is_observed"]
             named = free or one["type"] == "deterministic"
@@ -311,6 +313,11 @@ class FunctionModel:
                 raise TrustboError(
                     f"the site {name!r} of {self.in_short()} has the name of an axis of "
                     "posteriors; give it another name."
+                )
+            if named and taken.setdefault(safe(name), name) != name:
+                raise TrustboError(
+                    f"the sites {taken[safe(name)]!r} and {name!r} of {self.in_short()} would have "
+                    f"the same name {safe(name)!r} in a posterior; rename one of them."
                 )
             if one["type"] == "param" and not has_prior(name, trace):
                 raise TrustboError(

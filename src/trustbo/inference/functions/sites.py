@@ -25,6 +25,11 @@ class Site(NamedTuple):
     """Number of its coordinates in unconstrained space; 0 if it is not a latent variable."""
 
 
+def safe(name: str) -> str:
+    """Return the name of a variable in a DataTree, in which "/" separates groups."""
+    return name.replace("/", ".")
+
+
 def latent_in(trace: Mapping[str, Any]) -> list[str]:
     """Return the names of the latent variables in a trace."""
     return [
