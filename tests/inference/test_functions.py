@@ -746,7 +746,7 @@ def test_a_fingerprint_without_source_is_the_same_in_other_processes():
     assert run[0].stdout == run[1].stdout != b""
 
 
-def test_a_fingerprint_of_sets_is_the_same_in_other_processes():
+def test_a_fingerprint_of_sets_and_texts_is_the_same_in_other_processes():
     script = (
         "from types import SimpleNamespace\n"
         "from trustbo.inference.functions.identity import fingerprint as f\n"
@@ -754,13 +754,32 @@ def test_a_fingerprint_of_sets_is_the_same_in_other_processes():
         "settings = SimpleNamespace(names=names)\n"
         "def closed(v): return lambda awareness, contact_rate=None: v\n"
         "literal = lambda awareness, contact_rate=None: awareness in {'slope', 'tri', 'sight'}\n"
-        "print(f(closed(names)), f(closed(settings)), f(literal), f(closed({*names, 'tri'})))"
+        "import numpy as np\n"
+        "texts = [np.array(['slope', text], dtype=object) for text in ('tri', 'sight')]\n"
+        "print(f(closed(names)), f(closed(settings)), f(literal), f(closed({*names, 'tri'})),"
+        " *(f(closed(one)) for one in texts))"
     )
     command = [sys.executable, "-c", script]
     spaces = [os.environ | {"PYTHONHASHSEED": seed} for seed in ("1", "2")]
     run = [subprocess.run(command, capture_output=True, env=space) for space in spaces]
     assert run[0].stdout == run[1].stdout
-    assert len({*run[0].stdout.split()}) == 4
+    assert len({*run[0].stdout.split()}) == 6
+
+
+def test_a_fingerprint_does_not_change_when_an_object_is_used():
+    """A workspace caches properties, and xarray caches accessors."""
+    made = [
+        tb.Workspace.from_awareness(np.full((3, 4, 4, 1), z), features=("visibility",))
+        for z in (0.5, 0.5, 0.6)
+    ]
+
+    def of(workspace):
+        return lambda awareness, contact_rate=None: workspace.features.index("visibility")
+
+    before = [fingerprint(of(one)) for one in made]
+    assert before[0] == before[1] != before[2]
+    tb.Planner(made[0], (3, 0), (0, 3)).plan(TrustParams(0.4, np.array([0.2]), 0.0, 0.1, 0.1))
+    assert fingerprint(of(made[0])) == before[0]
 
 
 def test_a_fingerprint_tells_random_keys_apart():

@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from numpyro.distributions import Distribution
 from numpyro.primitives import Messenger
 
@@ -23,6 +24,8 @@ from trustbo.models.record import model_to_record
 
 _HASH_LENGTH = 16
 """Number of hexadecimal digits of a hash."""
+_PROTOCOL = 4
+"""Pickle protocol of the values that are hashed."""
 
 
 def name_of(function: Any) -> str:
@@ -117,7 +120,11 @@ def _describe(value: Any, parts: list[str], seen: dict[int, int]) -> None:
     elif isinstance(value, np.ndarray | jax.Array):
         is_key = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
         array = np.asarray(jax.random.key_data(value) if is_key else value)
-        parts.append(f"{array.dtype} {array.shape} {hashlib.sha256(array.tobytes()).hexdigest()}")
+        if array.dtype.hasobject:  # its bytes are addresses in memory
+            _describe(array.tolist(), parts, seen)
+        else:
+            digest = hashlib.sha256(array.tobytes()).hexdigest()
+            parts.append(f"{array.dtype} {array.shape} {digest}")
     elif isinstance(value, list | tuple | dict):
         _describe_items(value, parts, seen)
     elif _is_wrapper(value) or isinstance(value, Distribution | Messenger):
@@ -208,7 +215,7 @@ def _describe_other(value: Any, parts: list[str], seen: dict[int, int]) -> None:
     """
     content = io.BytesIO()
     try:  # the text must be the same in other processes
-        _Pickler(content, protocol=4).dump(value)
+        _Pickler(content, protocol=_PROTOCOL).dump(value)
         parts.append(hashlib.sha256(content.getvalue()).hexdigest())
     except Exception:
         parts.append(_kind_of(value))
@@ -219,14 +226,36 @@ def _describe_other(value: Any, parts: list[str], seen: dict[int, int]) -> None:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickler that stores the items of a set in the order of their texts.
+    """Pickler whose output depends neither on the process nor on earlier uses of the objects.
 
-    The order of strings in a set differs between processes.
+    The order of strings in a set differs between processes, so the items of a set are stored in the
+    order of their texts. Values of `functools.cached_property` and the accessors of xarray are left
+    out, because an object, such as a workspace, has them only after its first use.
     """
 
     def persistent_id(self, value: Any) -> Any:
         """Return the replacement of a set; None for other values."""
         return _sorted_texts(value) if isinstance(value, set | frozenset) else None
+
+    def reducer_override(self, value: Any) -> Any:
+        """Return how an object is stored without cached values, if its class has any."""
+        if isinstance(value, xr.DataArray | xr.Dataset):
+            return dict, (value.to_dict(data="array"),)
+
+        cached = {
+            name
+            for kind in type(value).__mro__
+            for name, one in vars(kind).items()
+            if isinstance(one, functools.cached_property)
+        }
+        if not cached:
+            return NotImplemented
+
+        reduced = value.__reduce_ex__(_PROTOCOL)
+        if isinstance(reduced, str) or len(reduced) < 3 or not isinstance(reduced[2], dict):
+            return reduced
+        state = {name: one for name, one in reduced[2].items() if name not in cached}
+        return (*reduced[:2], state, *reduced[3:])
 
 
 def _sorted_texts(items: set[Any] | frozenset[Any]) -> list[str]:
