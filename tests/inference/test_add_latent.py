@@ -47,6 +47,16 @@ def test_it_adds_what_fit_adds_at_once(missions, model, tmp_path):
     )
 
 
+def test_part_of_the_draws_keep_their_labels(missions):
+    part = fit(missions, PooledTrust(), draws=75, latent=False).isel(draw=slice(100, None, 2))
+    whole = add_latent(part)
+    labels = part["posterior"]["draw"].values
+    for group in ("log_likelihood", "log_prior"):
+        np.testing.assert_array_equal(whole[group]["draw"], labels)
+    for group in ("latent", "posterior_predictive"):
+        assert np.isin(whole[group]["draw"], labels).all()
+
+
 def test_missions_may_have_their_features_in_another_order():
     """The default priors depend on the names of the features."""
     features = ("traversability", "line_of_sight")

@@ -22,7 +22,7 @@ from trustbo.inference.draws import missions_of, read_posterior, require_posteri
 from trustbo.inference.functions.fit import forms_of_function
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.inference.learner import FunctionLearner, Model, learner_of_posterior
-from trustbo.inference.loo import LIKELIHOOD_OF, RATES, TICKS
+from trustbo.inference.tree import LIKELIHOOD_OF, RATES, TICKS
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.observations import Observations
 from trustbo.parallel import computing

@@ -32,15 +32,10 @@ from trustbo.inference.functions.fit import fit_function, log_likelihood_of_func
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.inference.importance import MAX_KHAT, smoothed
 from trustbo.inference.learner import FunctionLearner, Model, add_latent, learner_of_posterior
+from trustbo.inference.tree import LIKELIHOOD_OF, RATES, TICKS
 from trustbo.models.observations import Observations
 from trustbo.parallel import computing
 
-LIKELIHOOD_OF = "log_likelihood_of"
-"""Attribute of a posterior that states what its log-likelihoods refer to."""
-TICKS = "ticks"
-"""Value of this attribute for log probabilities of tick counts."""
-RATES = "contact_rate"
-"""Value of this attribute for log densities of rates; also the name of the rates."""
 _POINTS = 500
 """Maximum number of distinct hyperparameter draws that are used."""
 _N_REFIT = 1000

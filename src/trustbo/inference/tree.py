@@ -13,13 +13,19 @@ from trustbo.inference.draws import (
     effects_of,
     parameters_of,
 )
-from trustbo.inference.latent import latent_of, replicate
+from trustbo.inference.latent import Latent, latent_of, replicate
 from trustbo.inference.variables import draw_prior
 from trustbo.models.effects.effect import Effect
 from trustbo.models.observations import Observations
 from trustbo.models.scores import log_density
 from trustbo.streams import stream
 
+LIKELIHOOD_OF = "log_likelihood_of"
+"""Attribute of a posterior that states what its log-likelihoods refer to."""
+TICKS = "ticks"
+"""Value of this attribute for log probabilities of tick counts."""
+RATES = "contact_rate"
+"""Value of this attribute for log densities of rates; also the name of the rates."""
 _OF_RATES = ("mission", "bound", "robot")
 _DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_RATES)
 _N_TRAJECTORIES = 200
@@ -73,7 +79,6 @@ def to_datatree(
 
     tree = {}
     for group, arrays in groups.items():
-        draw = arrays.pop("draw", None)
         variables = {}
         used = set()
         shape = (0, 0)  # of chains and draws
@@ -93,8 +98,6 @@ def to_datatree(
             used |= set(dims)
 
         index = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
-        if draw is not None:
-            index["draw"] = draw
         labelled = {name: labels for name, labels in (coords | index).items() if name in used}
         # ArviZ takes the dims from the first variable, so variables with the most dims come first.
         ordered = dict(sorted(variables.items(), key=lambda item: -len(item[1][0])))
@@ -194,8 +197,7 @@ def with_latent(
     fitted.run_ep(draws.theta)
     seed = posterior.attrs["seed"]
 
-    n_chains = posterior["posterior"].sizes["chain"]
-    kept, some = kept_draws(posterior)
+    _, some = kept_draws(posterior)
     with slow_bar("latent trust", " draws", progress) as bar:
         fitted.evaluated = bar.update
         latent = latent_of(fitted, draws, some, stream(seed, "latent"))
@@ -205,38 +207,71 @@ def with_latent(
 
     # Log likelihoods of tick counts are comparable between families. They are NaN where ticks are
     # unknown.
-    likelihood = latent.log_likelihood
-    likelihood_of = "contact_rate"
+    of_counts = False
     shift = fitted.model.likelihood.log_resolution(
         fitted.observations.contact_rate, fitted.observations.n_ticks
     ).sum((1, 2))
     if not np.isnan(shift).any():
-        likelihood = likelihood + shift
-        likelihood_of = "ticks"
+        latent = latent._replace(log_likelihood=latent.log_likelihood + shift)
+        of_counts = True
+
+    densities = log_prior(fitted, parameters_of(posterior))
+    return add_groups(posterior, missions, latent, replicated, densities, of_counts=of_counts)
+
+
+def add_groups(
+    posterior: xr.DataTree,
+    missions: Sequence[Mission],
+    latent: Latent,
+    replicated: np.ndarray,
+    densities: Mapping[str, np.ndarray],
+    *,
+    of_counts: bool,
+) -> xr.DataTree:
+    """Add the groups that `add_latent` computes to a posterior.
+
+    Args:
+        posterior: DataTree with the parameters.
+        missions: Fitted missions.
+        latent: Trust, likelihoods and predictions, with chains joined.
+        replicated: Rates (draw, mission, bound, robot) drawn from the prior.
+        densities: Log prior densities (draw,) by name, with chains joined.
+        of_counts: Whether the log-likelihoods are of tick counts.
+    """
+    labels = {name: posterior["posterior"][name].values for name in ("chain", "draw")}
+    n_chains = len(labels["chain"])
 
     def by_chain(array: np.ndarray) -> np.ndarray:
         return array.reshape(n_chains, -1, *array.shape[1:])
 
     groups = {
-        "log_likelihood": {"contact_rate": by_chain(likelihood)},
+        "log_likelihood": {RATES: by_chain(latent.log_likelihood)},
         "latent": {
             "trust": by_chain(latent.trust),
             "trust_mean": latent.mean,
             "trust_sd": latent.sd,
-            "draw": kept,
         },
-        "posterior_predictive": {"contact_rate": by_chain(latent.predicted), "draw": kept},
-        "prior_predictive": {"contact_rate": replicated[None]},
-        "log_prior": {
-            name: by_chain(values)
-            for name, values in log_prior(fitted, parameters_of(posterior)).items()
-        },
+        "posterior_predictive": {RATES: by_chain(latent.predicted)},
+        "prior_predictive": {RATES: replicated[None]},
+        "log_prior": {name: by_chain(values) for name, values in densities.items()},
     }
-
     added = to_datatree(groups, missions, {})
     parts = {**posterior.children, **added.children}
-    whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
-    whole.attrs = posterior.attrs | {"log_likelihood_of": likelihood_of}
+    datasets = {name: part.to_dataset() for name, part in parts.items()}
+
+    # The draws have the labels of the posterior, which may be part of a longer one.
+    kept, _ = kept_draws(posterior)
+    some = labels | {"draw": labels["draw"][kept]}
+    for name, of_draws in (
+        ("log_likelihood", labels),
+        ("log_prior", labels),
+        ("latent", some),
+        ("posterior_predictive", some),
+    ):
+        datasets[name] = datasets[name].assign_coords(of_draws)
+
+    whole = xr.DataTree.from_dict(datasets)
+    whole.attrs = posterior.attrs | {LIKELIHOOD_OF: TICKS if of_counts else RATES}
     return whole
 
 

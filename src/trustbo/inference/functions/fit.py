@@ -35,7 +35,8 @@ from trustbo.inference.functions.nuts import (
     warm_start,
 )
 from trustbo.inference.functions.sites import Site, safe
-from trustbo.inference.tree import N_PRIOR, kept_draws, to_datatree
+from trustbo.inference.latent import Latent
+from trustbo.inference.tree import N_PRIOR, add_groups, kept_draws, to_datatree
 from trustbo.models.backend import library_attrs, own_settings
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
@@ -190,12 +191,12 @@ def with_latent_of_function(
     observations = Observations.from_missions(missions)
     data = _data_for(model, missions, observations)
     sites = model.sites(data)
-    n_chains = posterior["posterior"].sizes["chain"]
-    n_draws = n_chains * posterior["posterior"].sizes["draw"]
+    sizes = posterior["posterior"].sizes
+    n_draws = sizes["chain"] * sizes["draw"]
     n_missions = len(missions)
     seed = posterior.attrs["seed"]
 
-    kept, some = kept_draws(posterior)
+    _, some = kept_draws(posterior)
     rng = stream(seed, "latent of a function")
 
     shape = observations.contact_rate.shape
@@ -226,28 +227,12 @@ def with_latent_of_function(
             predicted[first:last] = rates[some[first:last] - begin]
             bar.update(len(found.log_likelihood))
 
+    sd = np.sqrt(np.maximum(square - mean**2, 0.0))
+    latent = Latent(trust, mean, sd, log_likelihood, predicted)
+    replicated = _prior_predictive(model, data, observations, seed)
+    densities = {name: np.concatenate(parts) for name, parts in log_prior.items()}
     of_counts = of_counts and _all_counted(observations)
-
-    def by_chain(array: np.ndarray) -> np.ndarray:
-        return array.reshape(n_chains, -1, *array.shape[1:])
-
-    groups = {
-        "log_likelihood": {"contact_rate": by_chain(log_likelihood)},
-        "latent": {
-            "trust": by_chain(trust),
-            "trust_mean": mean,
-            "trust_sd": np.sqrt(np.maximum(square - mean**2, 0.0)),
-            "draw": kept,
-        },
-        "posterior_predictive": {"contact_rate": by_chain(predicted), "draw": kept},
-        "prior_predictive": {"contact_rate": _prior_predictive(model, data, observations, seed)},
-        "log_prior": {n: by_chain(np.concatenate(parts)) for n, parts in log_prior.items()},
-    }
-    added = to_datatree(groups, missions, {})
-    parts = {**posterior.children, **added.children}
-    whole = xr.DataTree.from_dict({name: part.to_dataset() for name, part in parts.items()})
-    whole.attrs = posterior.attrs | {"log_likelihood_of": "ticks" if of_counts else "contact_rate"}
-    return whole
+    return add_groups(posterior, missions, latent, replicated, densities, of_counts=of_counts)
 
 
 def log_likelihood_of_function(
@@ -666,14 +651,14 @@ def _replicated(
 def _prior_predictive(
     model: FunctionModel, data: Data, observations: Observations, seed: int
 ) -> np.ndarray:
-    """Draw rates (chain, draw, mission, bound, robot) of the missions from the prior."""
+    """Draw rates (draw, mission, bound, robot) of the missions from the prior."""
     keys = _keys(N_PRIOR, seed + 1)
     values = model.over_draws("prior", 1, data)(keys)
     found: Found = model.over_draws("evaluate", 2, data)(values, keys)
     n_missions, n_bounds = observations.contact_rate.shape[:2]
     space, inputs = _form_of(found, n_missions, n_bounds)
     rng = stream(seed, "prior predictive")
-    return _replicated(space, inputs, observations, rng)[None]
+    return _replicated(space, inputs, observations, rng)
 
 
 def _tree(
