@@ -167,6 +167,15 @@ def test_a_mission_without_rates_is_left_out_of_the_sum():
 
 
 @of_few_missions
+def test_missions_have_the_labels_of_the_posterior():
+    missions = simulate_missions(6)
+    posterior = fit(missions[2:], PooledTrust(), earlier=missions[:2], draws=100)
+    labels = loo(posterior).elpd_i["mission"].values
+    np.testing.assert_array_equal(labels, posterior["log_likelihood"]["mission"])
+    assert labels.tolist() == [-2, -1, 0, 1, 2, 3]
+
+
+@of_few_missions
 def test_compare_ranks_as_arviz_does_and_refuses_other_missions():
     missions = simulate_missions(8)
     fits = {

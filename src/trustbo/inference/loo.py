@@ -14,7 +14,7 @@ likelihood.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -52,6 +52,8 @@ _LEAST_EFFECTIVE = 2.0
 class LeftOut(NamedTuple):
     """Data that are needed to leave out each mission of a posterior."""
 
+    labels: np.ndarray
+    """Label (mission,) of each mission in the posterior."""
     contact_rate: np.ndarray
     """Rates (mission, bound, robot)."""
     n_ticks: np.ndarray | None
@@ -96,7 +98,8 @@ def loo(posterior: xr.DataTree, *, model: Model | None = None, progress: bool = 
         progress: Whether to show a progress bar after 5 seconds.
 
     Returns:
-        Pointwise `ELPDData` of ArviZ for `az.compare({name: loo(posterior), ...})`. The coordinate
+        Pointwise `ELPDData` of ArviZ for `az.compare({name: loo(posterior), ...})`. Missions have
+        the labels of the posterior, which are negative for earlier missions. The coordinate
         `refitted` (mission,) of `elpd_i` and `pareto_k` marks refitted missions, for which
         `pareto_k` is the k-hat of the refit. The attribute `log_likelihood_of` of `elpd_i` states
         whether the densities refer to tick counts; only then are they comparable between
@@ -128,6 +131,7 @@ def left_out(who: str, posterior: xr.DataTree, model: Model | None = None) -> Le
 def estimated(target: LeftOut, *, progress: bool = True) -> ELPDData:
     """Leave out each mission that has rates; see `loo`."""
     measured = np.flatnonzero(~np.isnan(target.contact_rate).all((1, 2)))
+    labels = target.labels[measured]
     n_measured = len(measured)
     if n_measured < 2:
         raise TrustboError(f"loo needs at least 2 missions with rates; got {n_measured}.")
@@ -147,8 +151,8 @@ def estimated(target: LeftOut, *, progress: bool = True) -> ELPDData:
 
             if n_measured < _FEWEST or not k_hat[i] <= limit:
                 if target.refit is None:
-                    raise TrustboError(_no_refit(j, k_hat[i], limit, n_measured))
-                bar.set_description_str(f"loo, refit without mission {j}")
+                    raise TrustboError(_no_refit(labels[i], k_hat[i], limit, n_measured))
+                bar.set_description_str(f"loo, refit without mission {labels[i]}")
                 density[i], k_hat[i] = target.refit(j)
                 refitted[i] = True
                 bar.set_description_str("loo")
@@ -158,11 +162,11 @@ def estimated(target: LeftOut, *, progress: bool = True) -> ELPDData:
     if is_bad.any():
         warn(
             f"Estimated shape parameter of Pareto distribution is greater than {limit:.2f} for "
-            f"missions {measured[is_bad].tolist()}; the results may be inaccurate."
+            f"missions {labels[is_bad].tolist()}; the results may be inaccurate."
         )
 
     elpd = float(density.sum())
-    coords = {"mission": measured, "refitted": ("mission", refitted)}
+    coords = {"mission": labels, "refitted": ("mission", refitted)}
     attrs = {LIKELIHOOD_OF: RATES if target.is_density.any() else TICKS}
     return ELPDData(
         elpd=elpd,
@@ -183,7 +187,7 @@ def good_khat(n_effective: float) -> float:
     return float(min(1.0 - 1.0 / np.log10(max(n_effective, _LEAST_EFFECTIVE)), MAX_KHAT))
 
 
-def _no_refit(mission: int, k_hat: float, limit: float, n_missions: int) -> str:
+def _no_refit(mission: Any, k_hat: float, limit: float, n_missions: int) -> str:
     """Explain why a mission needs a refit that is not possible."""
     reason = f"k-hat of mission {mission} is {k_hat:.2f}, above {limit:.2f}"
     if n_missions < _FEWEST:
@@ -242,6 +246,7 @@ def _of_class(posterior: xr.DataTree, model: Model | None) -> LeftOut:
         return known[0] - rest + float(shift[j]), k_hat
 
     return LeftOut(
+        labels=_labels(posterior),
         contact_rate=y,
         n_ticks=n_ticks,
         is_density=is_density,
@@ -252,6 +257,11 @@ def _of_class(posterior: xr.DataTree, model: Model | None) -> LeftOut:
         efficiency=1.0,
         refit=refit,
     )
+
+
+def _labels(posterior: xr.DataTree) -> np.ndarray:
+    """Return the labels of the missions; those of earlier campaigns are negative."""
+    return posterior["constant_data"].to_dataset()["mission"].values
 
 
 def _n_effective(posterior: xr.DataTree) -> float:
@@ -298,6 +308,7 @@ def _of_function(posterior: xr.DataTree, model: FunctionModel) -> LeftOut:
         return log_mean, k_hat
 
     return LeftOut(
+        labels=_labels(posterior),
         contact_rate=observations.contact_rate,
         n_ticks=observations.n_ticks,
         is_density=is_measured & (not of_counts),
@@ -367,6 +378,7 @@ def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
     n_draws = len(flat)
     n_effective = min(float(ess.min()), float(n_draws))
     return LeftOut(
+        labels=log_p[dims[2]].values,
         contact_rate=y,
         n_ticks=np.asarray(ticks["n_ticks"].values, float) if "n_ticks" in ticks else None,
         is_density=is_measured & (of == RATES),

@@ -238,7 +238,8 @@ def add_groups(
         densities: Log prior densities (draw,) by name, with chains joined.
         of_counts: Whether the log-likelihoods are of tick counts.
     """
-    labels = {name: posterior["posterior"][name].values for name in ("chain", "draw")}
+    parameters = posterior["posterior"].to_dataset()
+    labels = {name: parameters[name].values for name in ("chain", "draw")}
     n_chains = len(labels["chain"])
 
     def by_chain(array: np.ndarray) -> np.ndarray:
