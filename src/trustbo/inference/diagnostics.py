@@ -15,6 +15,16 @@ MIN_ESS = 400.0
 """Smallest bulk effective sample size that is accepted for NUTS."""
 NUTS_NAMES = ("r_hat", "ess_bulk", "divergences")
 """Names of the diagnostics of NUTS."""
+_STATISTICS = {
+    "num_steps": "n_steps",
+    "diverging": "diverging",
+    "accept_prob": "acceptance_rate",
+    "energy": "energy",
+    "potential_energy": "lp",
+}
+"""ArviZ names of NumPyro's sampling statistics."""
+FIELDS = tuple(_STATISTICS)
+"""NumPyro's names of the sampling statistics that posteriors contain."""
 
 
 def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
@@ -31,6 +41,13 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
     attrs = require_posterior("diagnostics", posterior).attrs
     names = ("k_hat", "kish") if attrs["sampler"] == "importance" else NUTS_NAMES
     return {name: float(attrs[name]) for name in names}
+
+
+def statistics_of(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the sampling statistics of NumPyro under the names of ArviZ."""
+    stats = {ours: fields[theirs] for theirs, ours in _STATISTICS.items()}
+    stats["lp"] = -stats["lp"]  # NumPyro's potential is -log density
+    return stats
 
 
 def complaints_of(

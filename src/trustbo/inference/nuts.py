@@ -25,7 +25,7 @@ from scipy import optimize
 from trustbo.display import shows_bars
 from trustbo.inference import importance
 from trustbo.inference.density import Density, JointDraws
-from trustbo.inference.diagnostics import complaints_of
+from trustbo.inference.diagnostics import FIELDS, complaints_of, statistics_of
 from trustbo.models.backend import own_settings
 from trustbo.statespace.matrices import namespace
 from trustbo.streams import stream
@@ -48,14 +48,6 @@ _SHRINK = 0.01
 """Penalty on the shape of a marginal, in nats per point."""
 _SLOPE_STEP = 1e-4
 """Step of the finite differences at the starts of the chains."""
-_FIELDS = {
-    "num_steps": "n_steps",
-    "diverging": "diverging",
-    "accept_prob": "acceptance_rate",
-    "energy": "energy",
-    "potential_energy": "lp",
-}
-"""ArviZ names of NumPyro's sampling statistics."""
 
 
 class Whitened(NamedTuple):
@@ -166,13 +158,12 @@ def sample_by_nuts(
             kernel, num_warmup=warmup, num_samples=draws, num_chains=chains,
             chain_method="vectorized", progress_bar=progress and shows_bars(),
         )  # fmt: skip
-        mcmc.run(jax.random.key(seed), init_params=starts, extra_fields=tuple(_FIELDS))
+        mcmc.run(jax.random.key(seed), init_params=starts, extra_fields=FIELDS)
 
         fields = {name: np.asarray(v) for name, v in mcmc.get_extra_fields().items()}
         samples: Any = jax.tree.map(np.asarray, mcmc.get_samples())
 
-    stats = {ours: fields[theirs] for theirs, ours in _FIELDS.items()}
-    stats["lp"] = -stats["lp"]  # NumPyro's potential is -log density
+    stats = statistics_of(fields)
     resolution = density.observations.resolution
     if density.exact:
         z, log_jacobian = coordinates.scores(samples)

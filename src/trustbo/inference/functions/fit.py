@@ -12,7 +12,7 @@ from trustbo.data import Mission
 from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, require_kind, warn
-from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of
+from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, statistics_of
 from trustbo.inference.draws import joined_draws, names_in, require_same_order
 from trustbo.inference.functions.data import (
     RATES,
@@ -79,14 +79,6 @@ _MANY = 4000
 """Total number of draws per chain, over all runs, before bad diagnostics are reported."""
 _SIZE = 200
 """Number of draws for which latent trust is drawn at once."""
-_STATS = {
-    "num_steps": "n_steps",
-    "diverging": "diverging",
-    "accept_prob": "acceptance_rate",
-    "energy": "energy",
-    "potential_energy": "lp",
-}
-"""ArviZ names of NumPyro's statistics."""
 
 
 def fit_function(
@@ -122,8 +114,7 @@ def fit_function(
     samples, verdict = _sampled(
         model, data, sites, first, warmup, draws, seed=seed, progress=progress, check=check
     )
-    stats = {ours: samples.fields[theirs] for theirs, ours in _STATS.items()}
-    stats["lp"] = -stats["lp"]  # NumPyro's potential is -log density
+    stats = statistics_of(samples.fields)
 
     n_missions = len(missions)
     tree = _tree(model, _constrained(model, data, samples), sites, stats, missions, data, seed)

@@ -19,6 +19,7 @@ from numpyro.infer.hmc import hmc
 
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError
+from trustbo.inference.diagnostics import FIELDS
 from trustbo.inference.functions.data import Data, arrays_of
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.inference.functions.sites import Site
@@ -36,7 +37,6 @@ _RIDGE = 1e-3
 """Fraction of the variances that is added to the covariance of a previous posterior."""
 _DEPTH = 7
 """Largest number of doublings of a trajectory, which then has 127 steps."""
-_FIELDS = ("num_steps", "diverging", "accept_prob", "energy", "potential_energy")
 
 
 class Start(NamedTuple):
@@ -176,7 +176,7 @@ class Sampler:
 
             def one(state: Any, _: None) -> Any:
                 state = move(state, (arrays,), {})
-                return state, (state.z, {name: getattr(state, name) for name in _FIELDS})
+                return state, (state.z, {name: getattr(state, name) for name in FIELDS})
 
             last, (x, fields) = lax.scan(one, state, None, length=warmup + draws)
             kept = {name: values[warmup:] for name, values in fields.items()}
