@@ -21,6 +21,12 @@ from trustbo.errors import (
     require_whole,
 )
 from trustbo.inference.density import SWEEPS, Coefficients, Density, JointDraws
+from trustbo.inference.functions.fit import (
+    fit_function,
+    require_poolable_with_function,
+    with_latent_of_function,
+)
+from trustbo.inference.functions.function import as_model
 from trustbo.inference.importance import (
     MAX_KHAT,
     LogDensity,
@@ -30,6 +36,7 @@ from trustbo.inference.importance import (
     smoothed,
     systematic,
 )
+from trustbo.inference.nuts import sample_by_nuts
 from trustbo.inference.place_maps import place_group
 from trustbo.inference.tree import N_PRIOR, in_label_order, to_datatree, with_latent
 from trustbo.inference.variables import draws_of, prior_parameters, to_variables
@@ -157,17 +164,15 @@ def fit(
             missions, trust_model, sampler, workspace, draws, chains, warmup, seed, progress, start
         )
     else:
-        from trustbo.inference.functions import fit as of_function  # slow to import
-
-        function = of_function.as_model(model)
-        of_function.require_poolable_with_function(function, earlier, robots)
+        function = as_model(model)
+        require_poolable_with_function(function, earlier, robots)
         if sampler not in (None, "nuts"):
             raise TrustboError(f"a NumPyro function is sampled by 'nuts'; got {sampler!r}.")
-        tree, complaints = of_function.fit_function(
+        tree, complaints = fit_function(
             missions, function, workspace, draws, chains, warmup, seed, progress, check, start
         )
         add_latent = partial(
-            of_function.with_latent_of_function,
+            with_latent_of_function,
             missions=missions,
             model=function,
             progress=progress,
@@ -265,8 +270,6 @@ def _fit_model(
             reason = f"k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT}"
             complaints.append(f"importance weights are uneven ({reason})")
     else:
-        from trustbo.inference.nuts import sample_by_nuts  # slow to import
-
         drawn, stats, summary, complaints = sample_by_nuts(
             density, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
         )

@@ -25,7 +25,7 @@ _SEED = 20261126
 """Seed for the variables of single missions, which are drawn for the next mission."""
 _SAME = 1e-9
 """Largest difference, relative to the largest input, of inputs that should be equal."""
-_N_CHECKED = 2
+N_CHECKED = 2
 """Number of draws for which `require_plannable` runs the function."""
 
 
@@ -233,7 +233,7 @@ class FunctionDraws(Draws):
         Args:
             awareness: Awareness of the map, shape (robot, move, row, col, feature).
         """
-        some = self._some(np.arange(min(_N_CHECKED, self._numbers.size)))
+        some = self._some(np.arange(min(N_CHECKED, self._numbers.size)))
         z = awareness.reshape(self.n_robots, -1, self.n_features).swapaxes(0, 1)
         bounds = np.indices(awareness.shape[1:-1]).reshape(3, -1).T
         known = ~np.isnan(z).any((1, 2))

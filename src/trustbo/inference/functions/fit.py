@@ -22,8 +22,8 @@ from trustbo.inference.functions.data import (
     data_of_bounds,
     observations_of,
 )
-from trustbo.inference.functions.draws import FunctionDraws
-from trustbo.inference.functions.function import Found, FunctionModel, as_model
+from trustbo.inference.functions.draws import N_CHECKED, FunctionDraws
+from trustbo.inference.functions.function import Found, FunctionModel
 from trustbo.inference.functions.nuts import (
     Sampler,
     Samples,
@@ -45,15 +45,6 @@ from trustbo.statespace import kalman
 from trustbo.statespace.form import Inputs, StateSpace
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
-
-__all__ = [
-    "as_model",
-    "fit_function",
-    "forms_of_function",
-    "log_likelihood_of_function",
-    "require_poolable_with_function",
-    "with_latent_of_function",
-]
 
 _WARMUP = 300
 """Warm-up draws per chain of each run of NUTS, which are discarded."""
@@ -343,7 +334,7 @@ def prior_draws_of_function(
 
 def require_plannable(model: FunctionModel, workspace: Workspace) -> None:
     """Raise TrustboError if a function cannot plan in a workspace."""
-    draws = prior_draws_of_function(model, 2, 0, workspace)
+    draws = prior_draws_of_function(model, N_CHECKED, 0, workspace)
     draws.require_plannable(workspace.awareness.values)
 
 
