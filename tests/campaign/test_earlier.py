@@ -328,3 +328,32 @@ def test_function_of_places_is_refused_on_another_map(first):
 def test_function_with_other_robots_is_refused(first):
     with pytest.raises(TrustboError, match="rising"):
         tb.Campaign(cells(seed=2, robots=("r1", "r2")), *ENDS, earlier=first, model=rising)
+
+
+def test_missions_that_several_results_contain_are_used_once(workspace, first, tmp_path):
+    first.save(tmp_path / "first")
+    ours = tb.Campaign(workspace, *ENDS, earlier=first, **OPTIONS)
+    theirs = tb.Campaign(workspace, *ENDS, earlier=tb.load_result(tmp_path / "first"), **OPTIONS)
+    simulator = ModelSimulator(workspace)
+    for seed, campaign in enumerate((ours, theirs), start=10):
+        campaign.fail("stuck")
+        campaign.tell(simulator.run(campaign.ask().path, seed=seed))
+
+    n = len(first.missions)
+    for earlier in ([ours, theirs], [first, ours, theirs], [ours, first, theirs, ours]):
+        found = tb.Campaign(workspace, *OTHER_ENDS, earlier=earlier, **OPTIONS).state.earlier
+        assert len(found.missions) == n + 2
+        assert len(found.lost) == 2  # one of each, although they are equal
+
+    wider = cells(robots=("r1", "r2", "r3", "r4"))
+    found = tb.Campaign(wider, *OTHER_ENDS, earlier=[ours, theirs, first], **OPTIONS).state.earlier
+    assert len(found.missions) == n + 2
+
+
+def test_equal_missions_of_different_campaigns_are_all_used(workspace):
+    """Such as those of a simulator without noise."""
+    campaigns = [tb.Campaign(workspace, *ENDS, **OPTIONS) for _ in range(2)]
+    for campaign in campaigns:
+        campaign.tell(ModelSimulator(workspace).run(campaign.ask().path, seed=0))
+    found = tb.Campaign(workspace, *OTHER_ENDS, earlier=campaigns, **OPTIONS).state.earlier
+    assert len(found.missions) == 2

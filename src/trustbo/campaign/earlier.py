@@ -5,9 +5,9 @@ posterior given the missions of both. The earlier missions therefore enter every
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import xarray as xr
 
@@ -35,7 +35,8 @@ def earlier_missions(
     """Collect the missions of earlier campaigns for a campaign in a workspace.
 
     These are the missions that the campaigns used for learning, and those that they had taken from
-    still earlier campaigns. Missions on the map of the workspace have the map "".
+    still earlier campaigns. A mission that several of the results contain is used once. Missions on
+    the map of the workspace have the map "".
 
     Raises:
         TrustboError: An entry is not a result, its features differ from the workspace's, none of
@@ -52,8 +53,13 @@ def earlier_missions(
     here = map_name(workspace)
     missions: list[Mission] = []
     lost: list[LostMission] = []
+    of_missions: list[_Source] = []
+    of_lost: list[_Source] = []
     for k, result in enumerate(results):
+        if any(result is other for other in results[:k]):
+            continue
         what = "earlier" if result is earlier else f"earlier[{k}]"
+        inherited = result.state.earlier
         found = _missions_of(result)
         _require_alike(what, result, found.missions, workspace)
         there = map_name(result.workspace)
@@ -62,10 +68,16 @@ def earlier_missions(
             on = mission.map or there
             mission = mission.in_order(mission.robots, workspace.features, ())
             missions.append(replace(mission, map="" if on == here else on))
+        of_missions += _sources(k, len(inherited.missions), len(found.missions))
         if there == here:
             lost += found.lost
+            of_lost += _sources(k, len(inherited.lost), len(found.lost))
 
-    return EarlierMissions(tuple(pooled(workspace.team.names, missions)), tuple(lost))
+    alike = pooled(workspace.team.names, missions)
+    return EarlierMissions(
+        tuple(_without_repeats(alike, of_missions, Mission.has_same_data)),
+        tuple(_without_repeats(lost, of_lost, LostMission.__eq__)),
+    )
 
 
 def _missions_of(result: "Result") -> EarlierMissions:
@@ -73,6 +85,48 @@ def _missions_of(result: "Result") -> EarlierMissions:
     state = result.state
     own = [entry.mission for entry in state.entries if not is_excluded_by_user(entry)]
     return EarlierMissions((*state.earlier.missions, *own), tuple(state.lost))
+
+
+class _Source(NamedTuple):
+    """Origin of a mission.
+
+    Attributes:
+        result: Index of the result that contains it.
+        is_inherited: Whether that campaign had taken it from a still earlier one.
+    """
+
+    result: int
+    is_inherited: bool
+
+
+def _sources(result: int, n_inherited: int, n: int) -> list[_Source]:
+    """Return the origins of the n missions of a result, of which the first were inherited."""
+    return [_Source(result, i < n_inherited) for i in range(n)]
+
+
+def _without_repeats[T](
+    missions: Sequence[T], sources: Sequence[_Source], is_same: Callable[[T, T], bool]
+) -> list[T]:
+    """Return missions without those that are also in another result, because it inherited them.
+
+    Missions of two campaigns that are equal by chance are both kept, if neither is inherited.
+    """
+    kept: list[tuple[T, _Source]] = []
+    matched: set[tuple[int, int]] = set()  # index of a mission in `kept`, and of another result
+    for mission, source in zip(missions, sources, strict=True):
+        twin = None
+        for j, (other, of_other) in enumerate(kept):
+            is_possible = source.result != of_other.result and (j, source.result) not in matched
+            is_shared = source.is_inherited or of_other.is_inherited
+            if is_possible and is_shared and is_same(mission, other):
+                twin = j
+                break
+
+        if twin is None:
+            kept.append((mission, source))
+        else:
+            matched.add((twin, source.result))
+    return [mission for mission, _ in kept]
 
 
 def _require_alike(
