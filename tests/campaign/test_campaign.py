@@ -110,6 +110,9 @@ def test_options_of_planner_and_fit_are_passed_on(workspace):
     assert (sizes["chain"], sizes["draw"]) == (1, 120)
     with pytest.raises(TypeError, match="drws"):
         begin(workspace, fit={"drws": 3})
+    for option in ("start", "earlier"):  # which the campaign sets itself
+        with pytest.raises(TypeError, match=option):
+            begin(workspace, fit={option: None})
     with pytest.raises(TypeError, match="max_bound"):
         begin(workspace, planner={"max_bound": 3})
 

@@ -29,8 +29,10 @@ def require_options(what: str, options: Any) -> dict[str, Any]:
 
 def require_options_of_fit(options: Mapping[str, Any]) -> None:
     """Raise TypeError for options that `fit` does not have, or that the campaign sets itself."""
-    own = {"model": None, "sampler": None, "workspace": None, "seed": 0}
-    _FIT.bind([], **own, progress=True, latent=False, **options)
+    own = dict.fromkeys(
+        ("model", "earlier", "sampler", "workspace", "seed", "progress", "latent", "start")
+    )
+    _FIT.bind([], **own, **options)
 
 
 def to_settings(
