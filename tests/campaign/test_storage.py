@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -495,3 +496,69 @@ def test_flipped_bit_in_a_mission_that_waits_is_never_silent(folder):
         except Exception:  # the library has many types of errors
             n_refused += 1
     assert n_refused > 290  # the others are in the word before the hash
+
+
+def test_campaign_in_another_folder_needs_the_old_one_no_more(workspace, folder, tmp_path):
+    old = shutil.copytree(folder, tmp_path / "old")
+    campaign = tb.Campaign.load(old)
+    campaign.store_in(tmp_path / "new")
+    shutil.rmtree(old)
+    posteriors = campaign.posteriors
+    campaign.fail("rain")
+    campaign.close()
+    for one, other in zip(posteriors, tb.load_result(tmp_path / "new").posteriors, strict=True):
+        same_draws(one, other)
+
+
+def test_missions_of_a_lost_campaign_do_not_become_those_of_a_new_one(workspace, folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    (copy / "campaign.json").unlink()
+    missions = {file.name: file.read_bytes() for file in (copy / "missions").iterdir()}
+    with pytest.raises(tb.TrustboError, match="0001"):
+        begin(workspace, copy)
+    assert {file.name: file.read_bytes() for file in (copy / "missions").iterdir()} == missions
+    assert not (copy / "campaign.json").exists()
+
+    copy = shutil.copytree(folder, tmp_path / "gap")
+    shutil.copy(copy / "missions" / "0001.nc", copy / "missions" / "0009.nc")
+    with pytest.raises(tb.TrustboError, match="0009"):
+        begin(workspace, copy, overwrite=True)
+
+
+def test_hidden_files_of_other_programs_are_not_deleted(workspace, tmp_path):
+    others = [tmp_path / ".next" / "page.js", tmp_path / ".new-year" / "a", tmp_path / ".tmp-notes"]
+    for file in others:
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("mine")
+    begin(workspace, tmp_path).close()
+    begin(workspace, tmp_path, overwrite=True).close()
+    tb.Campaign.load(tmp_path).close()
+    assert all(file.read_text() == "mine" for file in others)
+
+
+def test_folder_that_another_process_filled_first_is_kept(workspace, folder, tmp_path, monkeypatch):
+    """Another process writes a campaign after this one has found no folder."""
+    make = Path.mkdir
+
+    def mkdir(path, **options):
+        if path == tmp_path / "new" and not path.exists():
+            shutil.copytree(folder, path)
+        make(path, **options)
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    with pytest.raises(tb.TrustboError, match="contains a campaign"):
+        begin(workspace, tmp_path / "new")
+    same(tb.load_result(tmp_path / "new"), tb.load_result(folder))
+
+
+def test_saved_result_with_a_waiting_mission_learns_when_it_is_loaded(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    with tb.Campaign.load(copy) as campaign:
+        campaign.ask()
+        del campaign.state.entries[-1], campaign.storage.files["missions/0004.nc"]
+        campaign.storage.write(campaign.state)
+    tb.load_result(copy).save(tmp_path / "saved")
+
+    with tb.Campaign.load(copy) as whole, tb.Campaign.load(tmp_path / "saved") as saved:
+        assert saved.state.asked is None  # that path was driven
+        same(saved, whole)

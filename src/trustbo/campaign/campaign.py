@@ -12,13 +12,13 @@ from trustbo.campaign.earlier import earlier_missions
 from trustbo.campaign.folder import FolderStorage
 from trustbo.campaign.learning import (
     AWARENESS,
+    add_entry,
     as_learned,
     informed_planner,
     instead_of_failure,
     is_excluded_by_user,
     learn,
     learn_hazard,
-    why_never_learned,
 )
 from trustbo.campaign.read import lock_campaign, read_campaign
 from trustbo.campaign.record import RECORD
@@ -140,7 +140,7 @@ class Campaign(Result):
             earlier: Results or campaigns whose missions are also data of this campaign, so that
                 their posterior is its prior. They may have other courses, terrains and teams.
                 Robots are matched by name. What was learned about places is used only if the map is
-                the same.
+                the same. A mission that several of them contain is used once.
             progress: Whether to show progress bars for slow fits.
 
         Raises:
@@ -216,11 +216,12 @@ class Campaign(Result):
             TrustboError: The folder already contains a campaign or cannot be written.
         """
         with self._turn:
-            self._use(
-                FolderStorage.begin(
-                    directory, self.workspace, self.state, overwrite=overwrite, take_over=overwrite
-                )
+            storage = FolderStorage.begin(
+                directory, self.workspace, self.state, overwrite=overwrite, take_over=overwrite
             )
+            for posterior in self.state.stored:
+                posterior.file = storage.stored(posterior)
+            self._use(storage)
 
     def _use(self, storage: Storage) -> None:
         """Record everything in a storage from now on."""
@@ -275,8 +276,8 @@ class Campaign(Result):
 
         if reason:
             warn(
-                f"mission {len(state.entries)} is recorded but cannot be used for learning yet: "
-                f"{reason.rstrip('.')}. Learning is retried after the next mission."
+                f"all missions are recorded ({len(state.entries)}), but the posterior cannot be "
+                f"updated yet: {reason.rstrip('.')}. Learning is retried after the next mission."
             )
 
     def _use_posterior(self, tree: xr.DataTree, n_used: int) -> None:
@@ -550,19 +551,9 @@ class Campaign(Result):
                 )
 
     def _add(self, entry: Entry) -> None:
-        """Add a mission that is on disk to the state, and mark the fit as due."""
-        state = self.state
-        entry.posterior = state.last
-        seed = state.seed_of("fit")
-        state.asked = None
-        state.entries.append(entry)
+        """Add a mission that is on disk, and mark the fit as due."""
+        add_entry(self.state, entry)
         self._computed.clear()
-
-        reason = why_never_learned(entry.mission)
-        if reason:
-            entry.become(EXCLUDED, reason)
-        else:
-            state.due = seed
 
     def _finish_mission(self, entry: Entry) -> None:
         """Learn from the last mission, or warn that it is excluded."""

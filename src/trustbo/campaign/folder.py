@@ -14,7 +14,7 @@ been replaced. If the process dies, no mission is lost: `Campaign.load` learns f
 that are not in campaign.json yet.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
@@ -28,13 +28,14 @@ from trustbo.campaign.record import (
     RECORD,
     WORKSPACE,
     mission_file,
+    mission_files,
     posterior_file,
     record_to_bytes,
 )
 from trustbo.campaign.replace import (
     commit_replacement,
     finish_replacement,
-    is_being_replaced,
+    has_campaign,
     new_folder,
     recorded_files,
     recover,
@@ -119,9 +120,10 @@ class FolderStorage:
                 files = _write_first(lock.path, workspace, state)
             return cls(lock, files)
         except BaseException:
-            lock.release()
-            if is_new:
+            # Another process may have made the folder, and written a campaign, in the meantime.
+            if is_new and not has_campaign(path):
                 remove_tree(path)
+            lock.release()
             raise
 
     def require_open(self) -> None:
@@ -162,6 +164,11 @@ class FolderStorage:
         record = record_to_bytes(state, self.files)
         write_file(self.path / RECORD, record, make_folder=False)
         self._written = _version_of(self.path / RECORD)
+
+    def stored(self, posterior: Posterior) -> StoredFile:
+        """Return the file of a posterior in this folder."""
+        name = posterior_file(posterior.name)
+        return StoredFile(self.path / name, self.files[name])
 
     def close(self) -> None:
         """Release the folder."""
@@ -260,6 +267,7 @@ def _write_first(folder: Path, workspace: Workspace, state: State) -> dict[str, 
     If this fails, the files are removed again. Files with these names that exist already are
     replaced only if they have the same content, as when an earlier process died here.
     """
+    _require_no_missions_of_others(folder, len(state.entries), [])
     files: dict[str, str] = {}
     written: list[Path] = []
     try:
@@ -283,6 +291,7 @@ def _write_first(folder: Path, workspace: Workspace, state: State) -> dict[str, 
 def _replace_campaign(folder: Path, workspace: Workspace, state: State) -> dict[str, str]:
     """Write a campaign beside the one in the folder, and then replace the old one."""
     old = recorded_files(folder)
+    _require_no_missions_of_others(folder, len(state.entries), old)
     beside = new_folder(folder)
     try:
         files = {
@@ -316,11 +325,27 @@ def _make_folder(path: Path) -> None:
 
 def _require_no_campaign(path: Path) -> None:
     """Raise TrustboError if a folder contains a campaign."""
-    if (path / RECORD).exists() or is_being_replaced(path):
+    if has_campaign(path):
         raise TrustboError(
             f"{str(path)!r} contains a campaign: continue it (Campaign.load, resume), give another "
             "folder, or replace it (overwrite)."
         )
+
+
+def _require_no_missions_of_others(folder: Path, n_missions: int, old: Sequence[str]) -> None:
+    """Raise TrustboError for missions that the new campaign in a folder would take for its own.
+
+    Args:
+        folder: Folder of the campaign.
+        n_missions: Number of missions of the new campaign.
+        old: Files of the campaign that is replaced.
+    """
+    for file in mission_files(folder):
+        if int(file.stem) > n_missions and file.relative_to(folder).as_posix() not in old:
+            raise TrustboError(
+                f"{str(file)!r} exists, but no campaign in this folder lists it; move it, or give "
+                "another folder."
+            )
 
 
 def _has_content(file: Path, content: bytes) -> bool:

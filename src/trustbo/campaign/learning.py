@@ -71,6 +71,20 @@ def why_never_learned(mission: Mission) -> str:
     return ""
 
 
+def add_entry(state: State, entry: Entry) -> None:
+    """Add a mission that is on disk to a state, and mark the fit as due."""
+    entry.posterior = state.last
+    seed = state.seed_of("fit")
+    state.asked = None
+    state.entries.append(entry)
+
+    reason = why_never_learned(entry.mission)
+    if reason:
+        entry.become(EXCLUDED, reason)
+    else:
+        state.due = seed
+
+
 def is_excluded_by_user(entry: Entry) -> bool:
     """Return whether a mission was excluded for another reason than `why_never_learned`."""
     own = why_never_learned(entry.mission) or None

@@ -8,15 +8,15 @@ from trustbo.campaign.learning import as_learned
 from trustbo.campaign.lock import FolderLock
 from trustbo.campaign.record import (
     EARLIER,
-    MISSIONS,
     RECORD,
     WORKSPACE,
     mission_file,
+    mission_files,
     posterior_file,
     record_from_bytes,
     state_from_record,
 )
-from trustbo.campaign.replace import is_being_replaced, recover
+from trustbo.campaign.replace import has_campaign, is_being_replaced, recover
 from trustbo.campaign.state import Entry, Posterior, State, StoredFile
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, interpreting, read_file, to_path
@@ -59,7 +59,8 @@ def read_campaign(
     """
     folder = require_campaign(directory)
     if is_being_replaced(folder):
-        lock_campaign(folder).release()  # refused while another process replaces it
+        with FolderLock(folder) as lock:  # refused while somebody replaces it
+            recover(lock.path)
 
     path = folder / RECORD
     record = record_from_bytes(read_file(path), path)
@@ -103,7 +104,7 @@ def _read_entries(
 
     Raises TrustboError if one is missing.
     """
-    there = sorted((folder / MISSIONS).glob("[0-9][0-9][0-9][0-9].nc"))
+    there = mission_files(folder)
     n_last = int(there[-1].stem) if there else 0
     entries = []
     for n in range(1, max(n_rows, n_last) + 1):
@@ -131,7 +132,7 @@ def require_campaign(directory: FilePath) -> Path:
     """Return the path of a folder; raises TrustboError if it contains no campaign."""
     path = to_path(directory)
     try:
-        found = (path / RECORD).exists() or is_being_replaced(path)
+        found = has_campaign(path)
     except OSError:
         found = False
     if not found:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,15 @@ POSTERIORS = "posteriors"
 def mission_file(n: int) -> str:
     """Return the path of mission n, counted from 1, in the folder of its campaign."""
     return f"{MISSIONS}/{n:04d}.nc"
+
+
+def mission_files(folder: Path) -> list[Path]:
+    """Return the files in a folder that are named like the missions of a campaign, in order."""
+    numbered = {}
+    for file in (folder / MISSIONS).glob("*.nc"):
+        if file.stem.isdecimal() and file == folder / mission_file(int(file.stem)):
+            numbered[int(file.stem)] = file
+    return [numbered[n] for n in sorted(numbered)]
 
 
 def posterior_file(name: str) -> str:

@@ -1,14 +1,15 @@
 """Replacement of the campaign in a folder by another one, as one operation.
 
-The new campaign is written to a folder `.new-*` inside the campaign's folder. When it is complete
-on disk, this folder is renamed to `.next`: from then on, the new campaign is the valid one. The
-files of the old campaign are then deleted, and the new ones are moved to their places. If the
-process dies in between, the next process that opens the folder continues. Only files that the old
-campaign lists are deleted.
+The new campaign is written to a folder `.trustbo-new-*` inside the campaign's folder. When it is
+complete on disk, this folder is renamed to `.trustbo-next`: from then on, the new campaign is the
+valid one. The files of the old campaign are then deleted, and the new ones are moved to their
+places. If the process dies in between, the next process that opens the folder continues. Only files
+that the old campaign lists are deleted.
 """
 
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterable
@@ -24,17 +25,24 @@ from trustbo.campaign.record import (
 from trustbo.errors import TrustboError
 from trustbo.files import TEMPORARY, interpreting, read_file, sync_folder, to_json, write_text
 
-_NEW = ".new-"
-_NEXT = ".next"
+_NEW = ".trustbo-new-"
+_NEXT = ".trustbo-next"
 _TO_DELETE = "to-delete.json"
-"""File in `.next` that lists the old files; it is removed when they are deleted."""
+"""File in `_NEXT` that lists the old files; it is removed when they are deleted."""
 _TO_MOVE = "to-move.json"
-"""File in `.next` that lists the new files; it is removed when they are in place."""
+"""File in `_NEXT` that lists the new files; it is removed when they are in place."""
+_TEMPORARY = re.compile(re.escape(TEMPORARY) + r"[0-9a-f]{8}\.(nc|json)")
+"""Names of the temporary files of `write_file` for the files of a campaign."""
 
 
 def is_being_replaced(folder: Path) -> bool:
     """Return whether replacing the campaign in a folder is in progress or was interrupted."""
     return (folder / _NEXT / _TO_MOVE).exists()
+
+
+def has_campaign(folder: Path) -> bool:
+    """Return whether a folder contains a campaign."""
+    return (folder / RECORD).exists() or is_being_replaced(folder)
 
 
 def recorded_files(folder: Path) -> list[str]:
@@ -139,7 +147,8 @@ def recover(folder: Path) -> None:
 
     for place in (folder, folder / MISSIONS, folder / POSTERIORS):
         for path in place.glob(f"{TEMPORARY}*"):
-            path.unlink(missing_ok=True)
+            if _TEMPORARY.fullmatch(path.name):
+                path.unlink(missing_ok=True)
 
 
 def remove_tree(path: Path) -> None:

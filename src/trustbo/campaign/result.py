@@ -12,6 +12,7 @@ import xarray as xr
 from trustbo.campaign.cache import computed
 from trustbo.campaign.folder import FolderStorage, without_lost_posteriors
 from trustbo.campaign.learning import (
+    add_entry,
     fitted_missions,
     informed_planner,
     instead_of_failure,
@@ -462,8 +463,7 @@ def load_result(
     """
     state, workspace, pending, _ = read_campaign(directory)
     for entry in pending:  # recorded, but not learned yet
-        entry.posterior = state.last
-        state.entries.append(entry)
+        add_entry(state, entry)
 
     if not state.entries:
         raise TrustboError(f"the campaign in {str(directory)!r} has no mission; run one first.")
