@@ -1,6 +1,7 @@
 """Grids of campaigns: what a row says, processes, and going on after a failure or a kill."""
 
 import os
+import types
 from functools import partial
 
 import numpy as np
@@ -112,6 +113,45 @@ class Counting:
 
     def recommend(self, campaign):
         return self.paths[-1] if self.paths else campaign.recommend().path
+
+
+def test_seconds_leave_out_the_evaluation_of_paths(tmp_path, monkeypatch):
+    """On a clock that only evaluations advance."""
+    now = [0.0]
+    monkeypatch.setattr(
+        "trustbo.study.grid.time", types.SimpleNamespace(process_time=lambda: now[0])
+    )
+
+    class Slow(Truth):
+        def lost(self, path):
+            now[0] += 1.0
+            return super().lost(path)
+
+    def slow_scene():
+        where = scene(0)
+        return where._replace(truth=Slow(where.workspace, where.truth.bounds))
+
+    cases = {"random": CASES["random"]}
+    table = run_grid(cases, {"slow": slow_scene}, tmp_path, n_missions=2, n_jobs=1)
+    assert (table["seconds"][1:] == 0.0).all()
+    assert now[0] > 0.0
+
+
+def test_contact_is_the_mean_of_what_was_measured(tmp_path):
+    class Blinking(Steady):
+        def run(self, path, **options):
+            mission = super().run(path, **options)
+            rates = mission.contact_rate.copy()
+            rates[0, 0] = np.nan
+            return tb.Mission.from_arrays(path, mission.awareness, rates)
+
+    def blinking():
+        where = scene(0)
+        return where._replace(simulator=Blinking(where.workspace))
+
+    cases = {"random": CASES["random"]}
+    table = run_grid(cases, {"one": blinking}, tmp_path, n_missions=1, n_jobs=1)
+    assert 0.0 < table["contact_rate"][1] < 1.0
 
 
 def test_a_policy_that_learns_by_itself_is_told_and_is_new_in_each_run(tmp_path):

@@ -104,3 +104,26 @@ def test_unknown_cases_and_columns_are_refused():
         differences(numbers, "theirs")
     with pytest.raises(TrustboError):
         summary(numbers, "colour")
+    with pytest.raises(TrustboError, match="colour"):
+        differences(numbers, "ours", by="colour")
+    assert differences(numbers, "ours", by="kind").equals(differences(numbers, "ours", ["kind"]))
+
+
+def test_one_case_alone_cannot_be_compared():
+    numbers = numbers_of(table_by_hand())
+    with pytest.raises(TrustboError, match="ours"):
+        differences(numbers[numbers["case"] == "ours"], "ours")
+
+
+def test_scenes_without_truth_have_no_regret():
+    table = table_by_hand()
+    judged = ["regret", "lost", "best", "driven", "best_driven", "failed_driven"]
+    table.loc[table["scene"] == "a", judged] = np.nan
+
+    numbers = numbers_of(table).set_index("scene")
+    of_truth = [name for name in numbers if "regret" in name or "lost" in name or "to 1" in name]
+    assert numbers.loc["a", of_truth].isna().all(axis=None)
+    np.testing.assert_allclose(numbers["arrive"], 2 / 3)
+    assert numbers.loc["b", of_truth].equals(
+        numbers_of(table_by_hand()).set_index("scene").loc["b", of_truth]
+    )

@@ -94,7 +94,8 @@ def run_grid(
         world of the next mission (see `Truth`). `status` and mean `contact_rate` describe the
         mission itself. `driven` and `best_driven` are the expected losses on the driven path and on
         the best path. `failed_driven` is the difference of these losses if bounds that fail or are
-        not reached count as fully lost. `seconds` is the CPU time.
+        not reached count as fully lost. `seconds` is the CPU time of planning, simulating and
+        learning, without the evaluation of the paths.
 
     Raises:
         TrustboError: A run failed; call the function again to repeat failed runs.
@@ -149,7 +150,7 @@ def _plain(name: str) -> str:
 
 
 def _read(file: Path, seed: int, scene: str, case: str) -> pd.DataFrame:
-    """Read the rows of a run; names and labels are texts, even if they look like numbers or NaN."""
+    """Read the rows of a run; texts such as "NA" are kept, and names may look like numbers."""
     table = pd.read_csv(file, keep_default_na=False, na_values=[""])
     return table.assign(case=case, scene=scene, seed=seed)
 
@@ -187,7 +188,7 @@ def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict
 
     with Campaign(**given) as campaign:
         policy = campaign.policy
-        yield {"mission": 0, **_recommended(campaign, scene, 0)}
+        yield {"mission": 0, **_recommended(_path_of(campaign), scene, 0)}
 
         began = time.process_time()
         driven = campaign.run(scene.simulator, n_missions)
@@ -195,20 +196,28 @@ def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict
         for number, (_, mission) in enumerate(driven, start=1):
             if hasattr(policy, "learn"):
                 policy.learn(campaign, mission)  # pyright: ignore[reportFunctionMemberAccess]
-            row = {"mission": number, **_recommended(campaign, scene, number)}
-            row |= {"status": mission.status, "contact_rate": mission.contact_rate.mean()}
+            path = _path_of(campaign)
+            seconds = time.process_time() - began
+
+            row = {"mission": number, **_recommended(path, scene, number)}
+            contact_rate = campaign.state.entries[-1].row["contact_rate"]
+            row |= {"status": mission.status, "contact_rate": contact_rate}
             row |= _driven(mission.path, scene, number - 1)
-            yield row | {"seconds": time.process_time() - began}
+            yield row | {"seconds": seconds}
             began = time.process_time()
 
 
-def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, float]:
+def _path_of(campaign: Campaign) -> Sequence[Cell]:
+    """Return the path that a campaign, or its policy, recommends."""
+    choose = getattr(campaign.policy, "recommend", None)
+    return campaign.recommend().path if choose is None else choose(campaign)
+
+
+def _recommended(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, float]:
     """Compute regret and loss of the path recommended before `mission`, an index from 0."""
     if scene.truth is None:
         return {}
 
-    choose = getattr(campaign.policy, "recommend", None)
-    path = campaign.recommend().path if choose is None else choose(campaign)
     truth = scene.truth.at(mission)
     best = truth.best(scene.start, scene.goal, **scene.judged)
     regret = truth.regret(path, **scene.judged)

@@ -43,7 +43,8 @@ def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     fully lost. `missions to 1 %` is the number of missions after which the regret stays within 1 %,
     or the number of missions plus one if it never does. `arrive` is the fraction of missions that
     reach the goal; `arrive of the first 3` and `arrive later` are the same fraction for the first
-    three missions and for the others. `seconds` is the CPU time per mission.
+    three missions and for the others. `seconds` is the CPU time per mission. In scenes without a
+    truth, quantities that need it are NaN.
 
     Raises:
         TrustboError: No scene has a truth.
@@ -73,16 +74,17 @@ def _numbers(run: pd.DataFrame) -> dict[str, float]:
     after = [n for n in SHOWN if n < len(run)]
     lost = (run["lost"] - run["best"]).to_numpy()
     arrived = driven["status"] == "ok"
+    has_truth = not np.isnan(regret).all()
     far = np.flatnonzero(~(regret <= NEAR))  # also NaN
-    n_until_near = far[-1] + 1 if len(far) else 0
+    n_until_near = far[-1] + 1.0 if len(far) else 0.0
 
     return {
         **{f"regret after {n}": regret[n] for n in after},
         **{f"lost after {n}": lost[n] for n in after},
-        "regret now": np.nanmean(regret),
+        "regret now": np.nanmean(regret) if has_truth else np.nan,
         "lost while learning": (driven["driven"] - driven["best_driven"]).mean(),
         "lost with failures": driven["failed_driven"].mean(),
-        f"missions to {NEAR:g} %": float(n_until_near),
+        f"missions to {NEAR:g} %": n_until_near if has_truth else np.nan,
         "arrive": arrived.mean(),
         "arrive of the first 3": arrived[:3].mean(),
         "arrive later": arrived[3:].mean(),
@@ -109,8 +111,7 @@ def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataF
         >>> tb.study.summary(numbers)["lost while learning"]
     """
     require_kind("numbers", numbers, pd.DataFrame, "give the rows of numbers_of")
-    names = require_list("by", [by] if isinstance(by, str) else by, str, "give names of columns")
-    by = [require_choice("column", name, numbers.columns) for name in names]
+    by = _columns(by, numbers)
     if not by:
         raise TrustboError("by must name at least one column; got none.")
 
@@ -121,7 +122,7 @@ def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataF
     return _table(rows, by)
 
 
-def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.DataFrame:
+def differences(numbers: pd.DataFrame, ours: str, by: str | Sequence[str] = ()) -> pd.DataFrame:
     """Compare one case with every other case on the same scenes and seeds.
 
     Args:
@@ -130,22 +131,27 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
         by: Columns, besides the other case, by which the pairs of runs are grouped.
 
     Returns:
-        Table of the differences, `ours` minus the other case, in the format of `summary`, with the
-        number of `pairs`. Intervals are over scenes; they are NaN if there is only one scene.
+        Table of the mean differences, `ours` minus the other case, in the format of `summary`, with
+        the number of `pairs`, and without "lost after n". Intervals are over scenes; they are NaN
+        if there is only one scene.
 
     Raises:
-        TrustboError: A case or column is unknown.
+        TrustboError: A case or column is unknown, or no other case has a scene and seed in common.
 
     Example:
         >>> numbers = tb.study.numbers_of(table)  # of `run_grid`
         >>> tb.study.differences(numbers, ours="default")["lost while learning"]
     """
-    require_choice("case", ours, list(numbers["case"]))
-    for name in by:
-        require_choice("column", name, numbers.columns)
+    require_kind("numbers", numbers, pd.DataFrame, "give the rows of numbers_of")
+    require_choice("case", ours, dict.fromkeys(numbers["case"]))
+    by = _columns(by, numbers)
 
     mine = numbers[numbers["case"] == ours]
     pairs = mine.merge(numbers[numbers["case"] != ours], on=["scene", "seed"], suffixes=("", " 2"))
+    if pairs.empty:
+        raise TrustboError(
+            f"no other case than {ours!r} has been run on the same scenes and seeds."
+        )
 
     rows: dict[Any, dict[tuple[str, str], float]] = {}
     names = [name for name in _values(numbers) if not name.startswith("lost after")]
@@ -157,6 +163,12 @@ def differences(numbers: pd.DataFrame, ours: str, by: Sequence[str] = ()) -> pd.
         label = key if by else key[0]  # pyright: ignore[reportIndexIssue]
         rows[label] = {("pairs", "value"): float(len(runs))} | row
     return _table(rows, [*by, f"{ours} less"])
+
+
+def _columns(by: str | Sequence[str], numbers: pd.DataFrame) -> list[str]:
+    """Return names of columns as a list; raises TrustboError if one is unknown."""
+    names = require_list("by", [by] if isinstance(by, str) else by, str, "give names of columns")
+    return [require_choice("column", name, numbers.columns) for name in names]
 
 
 def bootstrap(

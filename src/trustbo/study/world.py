@@ -160,18 +160,17 @@ class World:
         course: str,
         folder: FilePath | None = None,
         max_bounds: int | str = "shortest+4",
-        **options: Any,
     ) -> Scene:
         """Make the scene of a course for `run_grid`; `folder` caches the truth on disk.
 
-        See `workspace` for `options`. Raises TrustboError for an unknown course or missing files.
+        Raises TrustboError for an unknown course or missing files.
         """
-        workspace = self.workspace(**options)
+        workspace = self.workspace()
         paths = {"max_bounds": max_bounds}
         labels = {"world": self.name, "kind": self.kind, "of": self.case, "course": course}
 
         simulator = self.simulator(workspace)
-        truth = self.truth(folder)
+        truth = Truth.from_simulator(simulator, folder=folder)
         ends = self.ends(course)
         options = {"planner": paths}
         return Scene(workspace, simulator, *ends, truth, options, labels, paths)
