@@ -1,5 +1,6 @@
 """ROS bags, written by rosbags alone, as missions."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -161,3 +162,30 @@ def test_a_bound_of_another_type_is_refused_with_its_topic_and_type(workspace, t
         log.contact(robot, (3.0, True))
     with pytest.raises(TrustboError, match=r"/mission/bound.*std_msgs/msg/Bool"):
         read_bag(log.save(tmp_path / "bag"), workspace)
+
+
+@pytest.mark.parametrize(("end", "status"), [((0, 2), "ok"), ((1, 2), "aborted")])
+def test_a_mission_may_leave_the_planned_path(end, status, workspace, tmp_path):
+    """As after `Campaign.replan`: the second bound fails, and the lead drives back."""
+    log = Log()
+    plan = {"bound": 0, "cell": [2, 0], "path": [[2, 0], [1, 1], [0, 2]]}
+    log.text(1.0, "/mission/bound", json.dumps(plan))
+    driven = [(1, 1), (0, 2), (1, 1), (1, 2), (0, 2)]
+    driven = driven[: driven.index(end, 2) + 1]
+    for k, cell in enumerate(driven, start=1):
+        log.bound(10.0 * k, k, *cell)
+        log.contact("r1", (10.0 * k + 5.0, k % 2 == 0))
+        log.contact("r2", (10.0 * k + 5.0, True))
+        log.text(10.0 * k + 6.0, "/mission/status", "stuck" if k == 2 else "ok")
+
+    (one,) = read_bag(log.save(tmp_path / "bag"), workspace)
+    assert one.path == ((2, 0), *driven)
+    assert [bound.status for bound in one.bounds[:3]] == ["ok", "stuck", "ok"]
+    assert one.status == status
+    np.testing.assert_array_equal(one.contact_rate[:, 0], [k % 2 for k in range(len(driven))])
+
+
+def test_a_bag_may_lie_in_the_home_folder(driven, workspace, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    record(driven, tmp_path / "log.bag")
+    assert len(read_bag("~/log.bag", workspace)) == 2

@@ -2,14 +2,15 @@
 
     /mission/bound    std_msgs/String, JSON {"bound": k, "cell": [row, col]}, at the start of bound
                       k. Bound 0 is the start of a mission, in its start cell, and may have "path",
-                      the planned cells.
+                      the planned cells, which the mission may leave.
     /mission/status   std_msgs/String, "ok", "stuck", ..., optional, at the end of a bound
     /{robot}/contact  std_msgs/Bool, or Float32 or Float64 in [0, 1], at each tick: whether the
                       robot detects the lead or, while T2 closes up, the lead detects the robot
 
 A bound lasts from its marker to its status or, without a status, to the last contact message
 before the next marker. Its contact rate is the fraction of a robot's ticks with contact; NaN ticks
-are ignored. If the last bound is ok but not the last of the path, the mission is "aborted".
+are ignored. If the last bound is ok but does not reach the end of the planned path, the mission is
+"aborted".
 """
 
 import json
@@ -23,7 +24,7 @@ import pandas as pd
 
 from trustbo.data import Cell, Mission, require_unit_interval
 from trustbo.errors import TrustboError, one_line, require_pair, require_whole
-from trustbo.files import FilePath
+from trustbo.files import FilePath, to_path
 from trustbo.logs.table import read_table
 from trustbo.workspace import Workspace
 
@@ -64,7 +65,7 @@ def read_bag(
         >>> posterior = tb.fit(missions, workspace=workspace)
     """
     files = [path] if isinstance(path, str | PathLike) else path
-    paths = [Path(file) for file in files]
+    paths = [to_path(file) for file in files]
     space = f"/{prefix.strip('/')}" if prefix.strip("/") else ""
     of_bounds = space + _BOUND
     of_statuses = space + _STATUS
@@ -208,10 +209,14 @@ def _table(
     bounds: pd.DataFrame, ticks: pd.DataFrame, statuses: pd.Series, robots: Sequence[str]
 ) -> pd.DataFrame:
     """Return a mission as a table: rows of its planned cells, then rows of its bounds."""
-    start = bounds["cell"].iloc[0]
-    path = bounds["path"].iloc[0]
-    planned = [(0, *start), *((k, *cell) for k, cell in enumerate(path))]
-    tables = [pd.DataFrame(planned, columns=["bound", "row", "col"]).drop_duplicates()]
+    driven = tuple(bounds["cell"])
+    planned = bounds["path"].iloc[0]
+    left_path = planned[:1] == driven[:1] and planned[: len(driven)] != driven
+    path = driven if left_path else planned  # `read_table` refuses a path from another cell
+    reaches_end = not planned or (len(path) <= len(driven) and driven[-1] == planned[-1])
+
+    cells = [(0, *driven[0]), *((k, *cell) for k, cell in enumerate(path))]
+    tables = [pd.DataFrame(cells, columns=["bound", "row", "col"]).drop_duplicates()]
 
     for begin, k, (row, col), _, until in bounds.iloc[1:].itertuples(index=False):
         ended = statuses.loc[begin + 1 : until].iloc[:1]
@@ -224,7 +229,7 @@ def _table(
 
         duration = (end - begin) / _NANOSECONDS if end > begin else np.nan
         status = ended.iloc[0] if len(ended) else "ok"
-        if status == "ok" and k == len(bounds) - 1 < len(path) - 1:
+        if status == "ok" and k == len(driven) - 1 and not reaches_end:
             status = "aborted"  # no record of the reason
 
         contact = looks.groupby("robot")["contact"]
