@@ -312,3 +312,29 @@ def test_what_is_no_measurement_of_a_bound_is_refused(name, values):
 def test_a_log_without_bounds_is_refused():
     with pytest.raises(TrustboError, match="at least one bound"):
         Mission.from_arrays(PATH, np.zeros((0, 2, 2)), np.zeros((0, 2)))
+
+
+@pytest.mark.parametrize(
+    ("n_poses", "contact", "match"),
+    [
+        (4, np.ones((3, 2), bool), "contact has 3"),
+        (4, np.ones((4, 3), bool), "contact"),
+        (4, np.ones(4, bool), "contact"),
+        (4, np.array([[1.0, 0.0], [np.nan, 1.0], [1.0, 1.0], [0.0, 1.0]]), "contact"),
+        (None, np.full((3, 2), 0.5), "contact"),
+        (0, None, "poses"),
+    ],
+)
+def test_poses_and_contact_of_a_bound_have_the_same_ticks(n_poses, contact, match):
+    poses = None if n_poses is None else np.zeros((n_poses, 3 if n_poses else 2, 3))
+    unknown = np.full((2, 1), np.nan)
+    with pytest.raises(TrustboError, match=match):
+        Bound((0, 1), unknown, unknown[:, 0], unknown[:, 0], poses=poses, contact=contact)
+
+
+def test_contact_at_ticks_may_be_numbers():
+    unknown = np.full((2, 1), np.nan)
+    contact = np.array([[1, 0], [1, 1], [0, 0]])
+    poses = np.zeros((3, 3, 3))
+    bound = Bound((0, 1), unknown, unknown[:, 0], unknown[:, 0], poses=poses, contact=contact)
+    assert bound.contact is contact

@@ -52,14 +52,16 @@ class Bound:
         t0: Start of the bound, s since the mission's start.
         poses: Shape (tick, 1 + robot, 3), the lead first: x and y in CRS metres, heading in rad
             from east, anticlockwise. None where not recorded.
-        contact: Contact of each robot at each tick, shape (tick, robot). None where not recorded.
+        contact: Whether each robot has contact at each tick, shape (tick, robot), at the ticks of
+            `poses`. None where not recorded.
         n_ticks: Number of ticks over which `contact_rate` is averaged, shape (robot,); NaN where
             not recorded.
 
     Raises:
-        TrustboError: The arrays disagree on the number of robots, a value is outside [0, 1], a
-            duration is infinite or not positive, n_ticks is not a positive whole number, a rate is
-            not a multiple of 1 / n_ticks, or the status is unknown.
+        TrustboError: The arrays disagree on the number of robots or ticks, a value is outside
+            [0, 1], a duration is infinite or not positive, n_ticks is not a positive whole number,
+            a rate is not a multiple of 1 / n_ticks, contact at a tick is neither True nor False, or
+            the status is unknown.
 
     Example:
         >>> bound = mission.bounds[0]
@@ -98,12 +100,6 @@ class Bound:
             if shape != per_robot:
                 raise TrustboError(f"{name} of a bound must be {per_robot}; got shape {shape}.")
 
-        n_robots = len(self.awareness)
-        for name, per_tick in {"poses": (1 + n_robots, 3), "contact": (n_robots,)}.items():
-            shape = np.shape(getattr(self, name))
-            if getattr(self, name) is not None and shape[1:] != per_tick:
-                wanted = ("tick", *per_tick)
-                raise TrustboError(f"{name} of a bound must be {wanted}; got shape {shape}.")
         require_choice("status", self.status, STATUSES)
 
         mapped = self.cell != NOWHERE
@@ -125,6 +121,7 @@ class Bound:
 
         ticks = require_shares(self.contact_rate, self.n_ticks)
         object.__setattr__(self, "n_ticks", ticks)
+        _require_recorded(len(self.awareness), self.poses, self.contact)
 
     def __repr__(self) -> str:
         rates = ", ".join(f"{rate:.3f}" for rate in self.contact_rate)
@@ -518,6 +515,30 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> np.ndarray:
             "give all decimals, or leave n_ticks out."
         )
     return ticks
+
+
+def _require_recorded(n_robots: int, poses: Any, contact: Any) -> None:
+    """Raise TrustboError unless poses and contact of a bound have the same ticks and robots."""
+    shapes = {"poses": (1 + n_robots, 3), "contact": (n_robots,)}
+    n_ticks = set()
+    for name, values in (("poses", poses), ("contact", contact)):
+        if values is None:
+            continue
+        shape = np.shape(values)
+        if not shape or shape[1:] != shapes[name]:
+            raise TrustboError(f"{name} of a bound must be (tick, *{shapes[name]}); got {shape}.")
+        n_ticks.add(shape[0])
+
+    if len(n_ticks) > 1:
+        raise TrustboError(
+            f"poses of a bound have {len(poses)} ticks, but contact has {len(contact)}; give both "
+            "at the same times."
+        )
+    if contact is not None and not np.isin(contact, (0, 1)).all():
+        raise TrustboError(
+            "contact of a bound must be True or False at each tick; give contact=None if it was "
+            "not measured at some ticks, and the contact_rate of the others."
+        )
 
 
 def require_unit_interval(what: str, values: np.ndarray) -> np.ndarray:

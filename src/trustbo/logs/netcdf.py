@@ -90,7 +90,9 @@ def _seal_of(content: bytes) -> bytes:
 
 
 def write_missions(path: FilePath, missions: Sequence[Mission]) -> None:
-    """Write missions with the same robots and features, and their ticks, to a netCDF file.
+    """Write missions with the same robots and features to a netCDF file.
+
+    The poses and contacts of bounds that have both are included.
 
     Example:
         >>> tb.logs.write_missions("missions.nc", result.missions)
@@ -128,7 +130,7 @@ def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
 
 
 def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
-    """Convert missions to a tree, with ticks for bounds that have poses and contacts.
+    """Convert missions to a tree; see `write_missions`.
 
     Raises:
         TrustboError: The robots or features differ between missions.
