@@ -1,5 +1,7 @@
 """Tables of missions: what is written comes back, and what is amiss is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -184,3 +186,12 @@ def test_only_missions_of_one_team_and_kind_make_a_frame():
     for made in ([], mapped, [mapped, bare], [mapped, other], [taken]):
         with pytest.raises(TrustboError):
             to_frame(made)
+
+
+def test_missions_with_a_scale_or_a_map_are_refused():
+    """Read back, they would be contact on the map of the workspace."""
+    z, y = np.full((2, 1, 2), 0.5), np.zeros((2, 1))
+    mission = Mission.from_arrays(PATH, z, y)
+    for name, value in (("scale", "likert7"), ("map", "another")):
+        with pytest.raises(TrustboError, match=name):
+            to_frame([mission, replace(mission, **{name: value})])

@@ -36,8 +36,9 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
 
     Raises:
         TrustboError: The missions have different robots or features, only some of them have a path,
-            a feature has the name of another column, or the name of a robot or feature would be
-            changed by a CSV file or is a formula for spreadsheets.
+            one has a `scale` or a `map`, for which a table has no column, a feature has the name of
+            another column, or the name of a robot or feature would be changed by a CSV file or is a
+            formula for spreadsheets.
 
     Example:
         >>> tb.logs.to_frame(missions).to_csv("log.csv", index=False)
@@ -53,6 +54,11 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
 
     if len({bool(mission.path) for mission in missions}) > 1:
         raise TrustboError("some missions have a path and some do not; write them to two tables.")
+    if any(mission.scale or mission.map for mission in missions):
+        raise TrustboError(
+            "a table has no column for the scale of reports or the map of a mission; use "
+            "logs.write_missions."
+        )
 
     rows = []
     for j, mission in enumerate(missions, start=1):
