@@ -151,7 +151,7 @@ class Columns:
             self.refuse(column, np.isnan(parsed), "is blank")
         if whole:
             self.refuse(column, parsed > np.floor(parsed), "must be a whole number")
-        return cells.to_numpy(float, na_value=np.nan)
+        return parsed
 
     def decimals(self, column: str) -> int:
         """Return the number of decimals with which the values of a column are written."""
