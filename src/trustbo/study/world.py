@@ -13,7 +13,7 @@ from scipy import ndimage
 from trustbo import terrain
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_choice
-from trustbo.files import FilePath
+from trustbo.files import FilePath, to_path
 from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
 from trustbo.simulation.events import Event
 from trustbo.study.grid import Scene
@@ -105,7 +105,7 @@ class World:
         if self.data is None and self.is_packaged:
             return list(EXAMPLE_FILES)
 
-        folder = "" if self.data is None else Path(self.data).absolute()
+        folder = "" if self.data is None else to_path(self.data).absolute()
         files = [Path(folder, self.ground, f"{name}.tif") for name in ("dem", "dsm")]
         absent = [str(file) for file in files if self.data is None or not file.is_file()]
         if absent:
@@ -213,14 +213,14 @@ class World:
         return nearest(start), nearest(goal)
 
 
-def aged(now: xr.Dataset, seed: int = 0) -> xr.Dataset:
+def aged(now: xr.Dataset) -> xr.Dataset:
     """Imitate an outdated survey of a terrain, with errors in the canopy and the ground.
 
     The canopy has 0.7 times its true height. On 15 % of the area, in patches of about 10 m, the
     canopy is missing. The ground errors have a standard deviation of 0.3 m and a correlation length
     of about 10 m.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     step = abs(float(now["x"][1] - now["x"][0]))
     dem = now["dem"].values
     dsm = now["dsm"].values
