@@ -179,7 +179,7 @@ class Follower(Summary):
             TrustboError: A bound is in progress, or `Campaign.replan` raises an error. The follower
                 is then unchanged.
         """
-        self._require(running=False, t=self._last if self.bounds else 0.0)
+        self._require(running=False)
         n = len(self.bounds)
         if cell is None:
             cell = self.path[n - 1] if self._is_over else self.path[n]
@@ -236,11 +236,11 @@ class Follower(Summary):
         self._counts = counts
         self._last = t
 
-    def _require(self, *, running: bool, t: float) -> None:
+    def _require(self, *, running: bool, t: float | None = None) -> None:
         """Raise TrustboError if the call is out of order or `t` is before the previous time."""
         if running != self.running:
             if running:
                 raise TrustboError("no bound is in progress; call begin first.")
             raise TrustboError("a bound is in progress; call end first.")
-        if require_finite("t", t) < self._last:
+        if t is not None and require_finite("t", t) < self._last:
             raise TrustboError(f"t = {t} s must not be before the last time, {self._last} s.")
