@@ -80,7 +80,7 @@ def test_trust_tick_by_tick_is_that_of_a_filter_of_whole_bounds(model, n_mission
     campaign = begun(model, n_missions)
     reference, follower = filter_of(campaign), tb.Follower(campaign)
     path = follower.path
-    mission = as_learned(whole(path, looks(len(path) - 1)), campaign.workspace)
+    mission = as_learned(whole(path, looks(len(path) - 1)), campaign.workspace, "map")
     z, y, n = mission.awareness, mission.contact_rate, mission.n_ticks
     np.testing.assert_allclose(follower.trust, reference.state, rtol=1e-10)
     for k in follow(follower, looks(len(path) - 1)):

@@ -562,3 +562,15 @@ def test_saved_result_with_a_waiting_mission_learns_when_it_is_loaded(folder, tm
     with tb.Campaign.load(copy) as whole, tb.Campaign.load(tmp_path / "saved") as saved:
         assert saved.state.asked is None  # that path was driven
         same(saved, whole)
+
+
+def test_saved_result_whose_last_posterior_is_damaged_learns_it_again(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / "copy")
+    last = tb.load_result(copy).state.last
+    last.file.path.write_bytes(b"damaged")
+    with pytest.warns(UserWarning, match="posteriors"):
+        tb.load_result(copy).save(tmp_path / "saved")
+    with tb.Campaign.load(tmp_path / "saved") as campaign:
+        assert campaign.state.last is not None
+        missions = campaign.state.posterior.attrs["missions"]
+        np.testing.assert_array_equal(missions, tb.load_result(folder).posterior.attrs["missions"])

@@ -760,7 +760,7 @@ class Campaign(Result):
                 n = len(state.entries) + len(pending)
                 say(f"fitting mission {n}, which was recorded but not used for learning")
             if state.due is not None:
-                campaign._finish("an exclusion is recorded")
+                campaign._finish("the campaign is recorded")
 
             for entry in pending:
                 campaign._catch_up()

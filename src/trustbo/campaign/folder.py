@@ -227,7 +227,10 @@ def _content_of(posterior: Posterior) -> bytes:
 
 
 def without_lost_posteriors(state: State) -> State:
-    """Return a state without the posteriors whose files cannot be read any more, with a warning."""
+    """Return a state without the posteriors whose files cannot be read any more, with a warning.
+
+    If the last one is missing, a fit is due, so that the next plan does not come from the prior.
+    """
     initial = state.initial
     lost = []
     if initial is not None and _is_lost(initial):
@@ -245,9 +248,12 @@ def without_lost_posteriors(state: State) -> State:
         return state
     warn(
         f"the posteriors after the missions {lost} cannot be read and are not saved. The missions "
-        "are complete."
+        "are complete, and Campaign.load computes the last posterior again."
     )
-    return replace(state, entries=entries, initial=initial)
+    remaining = replace(state, entries=entries, initial=initial)
+    if entries and remaining.last is None and state.due is None:
+        remaining.due = state.seed_of("fit")
+    return remaining
 
 
 def _is_lost(posterior: Posterior) -> bool:

@@ -34,7 +34,7 @@ AWARENESS = ("map", "measured")
 """Sources of awareness from which a campaign learns."""
 
 
-def as_learned(mission: Mission, workspace: Workspace, awareness: str = "map") -> Mission:
+def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Mission:
     """Return a mission with the awareness from which a campaign learns.
 
     Args:
