@@ -59,3 +59,9 @@ def test_an_odd_table_is_refused_in_one_line(changes, options):
     with pytest.raises(TrustboError) as caught:
         read(GOOD | changes, **options)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("inputs", [["failure"], ["load", "load"], ["load", "Load"]])
+def test_features_with_one_name_are_refused(inputs):
+    with pytest.raises(TrustboError, match="inputs"):
+        read(GOOD | {"failure": [3.0, 1.0, 4.0, 1.0, 5.0]}, inputs=inputs)

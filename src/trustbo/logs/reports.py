@@ -9,10 +9,12 @@ import numpy as np
 from trustbo.arrays import without_rounding
 from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_kind, require_list
-from trustbo.logs.columns import Columns, require_one_spelling
+from trustbo.logs.columns import Columns, folded, require_one_spelling
 
 _YES = ("1", "true", "yes", "success", "succeeded", "ok")
 _NO = ("0", "false", "no", "failure", "failed", "fail")
+_OUTCOMES = ("success", "failure")
+"""Features of an outcome."""
 _WORDS = ", and words as numbers: frame[column].map({'agree': 6})"
 
 
@@ -49,8 +51,9 @@ def read_reports(
         number of levels minus 1, such as 6.
 
     Raises:
-        TrustboError: A column is missing, a row is repeated, a value has the wrong type or is off
-            the scale, a person has no reports, or there is neither an outcome nor an input.
+        TrustboError: A column is missing, a row or an input is repeated, a value has the wrong type
+            or is off the scale, a person has no reports, or there is neither an outcome nor an
+            input.
 
     Example:
         >>> people = tb.logs.read_reports("answers.csv", outcome="outcome", scale="likert7")
@@ -63,6 +66,12 @@ def read_reports(
     inputs = require_list("inputs", inputs, str, "give the names of columns")
     if outcome is None and not inputs:
         raise TrustboError("give the column of outcomes (outcome=) or other columns (inputs=).")
+    features = [*inputs, *(() if outcome is None else _OUTCOMES)]
+    if len({folded(name) for name in features}) < len(features):
+        raise TrustboError(
+            f"inputs must be different columns, which are not called {' or '.join(_OUTCOMES)} if "
+            f"there is an outcome; got {inputs}."
+        )
 
     columns = Columns(table)
     people = np.array(columns.texts(person, blank=False))
@@ -113,7 +122,7 @@ def _seen(columns: Columns, outcome: str | None, inputs: Sequence[str]) -> dict[
         given = np.array([text.lower() for text in columns.texts(outcome)])
         unknown = ~np.isin(given, ["", *_YES, *_NO])
         columns.refuse(outcome, unknown, "must be 1 or 0, success or failure, or blank")
-        seen["success"] = np.isin(given, _YES).astype(float)
-        seen["failure"] = np.isin(given, _NO).astype(float)
+        for name, words in zip(_OUTCOMES, (_YES, _NO), strict=True):
+            seen[name] = np.isin(given, words).astype(float)
 
     return seen | {name: columns.numbers(name, blank=False, hint=_WORDS) for name in inputs}
