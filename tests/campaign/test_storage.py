@@ -1,5 +1,6 @@
 """The folder of a campaign: a process that dies at any write resumes with identical results."""
 
+import copy
 import errno
 import json
 import os
@@ -574,3 +575,21 @@ def test_saved_result_whose_last_posterior_is_damaged_learns_it_again(folder, tm
         assert campaign.state.last is not None
         missions = campaign.state.posterior.attrs["missions"]
         np.testing.assert_array_equal(missions, tb.load_result(folder).posterior.attrs["missions"])
+
+
+def test_copy_of_a_campaign_leaves_the_original_as_it_is(folder, tmp_path):
+    original = tb.Campaign.load(shutil.copytree(folder, tmp_path / "copy"))
+    n_missions = len(original.missions)
+    states = original.table()["state"].tolist()
+
+    other = copy.copy(original)
+    simulator = ModelSimulator(other.workspace)
+    other.tell(simulator.run(other.ask().path, seed=5))
+    other.fail("rain")
+    other.exclude(2, "the lidar was covered")
+    assert len(original.missions) == n_missions
+    assert original.table()["state"].tolist() == states
+
+    original.tell(simulator.run(original.ask().path, seed=6))
+    original.close()
+    same(tb.load_result(tmp_path / "copy"), original)

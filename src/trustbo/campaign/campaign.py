@@ -276,8 +276,8 @@ class Campaign(Result):
 
         if reason:
             warn(
-                f"all missions are recorded ({len(state.entries)}), but the posterior cannot be "
-                f"updated yet: {reason.rstrip('.')}. Learning is retried after the next mission."
+                f"all is recorded, but the posterior after mission {len(state.entries)} cannot be "
+                f"computed yet: {reason.rstrip('.')}. Learning is retried after the next mission."
             )
 
     def _use_posterior(self, tree: xr.DataTree, n_used: int) -> None:

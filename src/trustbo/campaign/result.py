@@ -92,6 +92,8 @@ class Result(Summary):
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._turn = threading.RLock()
+        self.state = self.state.copy()  # `copy.copy` passes the state of the original
+        self._computed = dict(self._computed)
 
     def _rows(self) -> Rows:
         state = self.state

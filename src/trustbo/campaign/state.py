@@ -1,8 +1,8 @@
 """State of a campaign: missions with plans and posteriors, and missions given up."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import xarray as xr
@@ -192,6 +192,11 @@ class State:
             LostMission(failure.path, failure.where) for failure in self.failures if failure.path
         ]
         return [*self.earlier.lost, *own]
+
+    def copy(self) -> Self:
+        """Return a state whose missions and failures can change independently of this one."""
+        entries = [replace(entry) for entry in self.entries]
+        return replace(self, entries=entries, failures=list(self.failures))
 
     def indices(self, *states: str) -> list[int]:
         """Return the indices of the missions in one of these states."""
