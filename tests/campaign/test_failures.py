@@ -283,3 +283,12 @@ def test_contradictory_reports_of_failures_are_refused(workspace):
         with pytest.raises(tb.TrustboError, match=named):
             campaign.fail(**arguments)
     assert (campaign.state.failures, campaign.missions) == ([], [])
+
+
+def test_causes_are_read_regardless_of_case(workspace):
+    campaign = begin(workspace)
+    path = campaign.ask().path
+    campaign.fail(" Stuck")
+    assert campaign.state.lost == [LostMission(path)]
+    campaign.fail("The lead was Stuck in my office")
+    assert campaign.state.lost == [LostMission(path)]

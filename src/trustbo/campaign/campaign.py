@@ -208,6 +208,8 @@ class Campaign(Result):
     def store_in(self, directory: FilePath, *, overwrite: bool = False) -> None:
         """Write the campaign to a folder, and record everything there from now on.
 
+        A folder that the campaign used before remains as it is, and is released.
+
         Args:
             directory: Folder, as in the constructor.
             overwrite: Whether to replace an existing campaign in that folder.
@@ -221,7 +223,10 @@ class Campaign(Result):
             )
             for posterior in self.state.stored:
                 posterior.file = storage.stored(posterior)
+
+            before = self.storage
             self._use(storage)
+            before.close()
 
     def _use(self, storage: Storage) -> None:
         """Record everything in a storage from now on."""
@@ -617,6 +622,9 @@ class Campaign(Result):
         """
         if not isinstance(reason, str) or not reason.strip():
             raise TrustboError(f"reason must be a text such as {CAUSES[0]!r}; got {reason!r}.")
+        if reason.strip().lower() in CAUSES:  # as in tables
+            reason = reason.strip().lower()
+
         with self._turn:
             self.storage.require_open()
             path = self.ask().path if reason in CAUSES or where is not None else ()
