@@ -152,20 +152,14 @@ def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:
     if band is not None:
         band = band[0] - lost, band[1] - lost
 
-    grid = rest.workspace.grid
-    rows, cols = np.array(path).T
-    positions = np.stack([grid.x[cols], grid.y[rows]], axis=1)
     return replace(
         rest,
         path=path,
-        positions=positions,
-        length=float(np.hypot(*np.diff(positions, axis=0).T).sum()),
         trust=np.concatenate([driven.trust, rest.trust]),
         bands=np.concatenate([driven.bands, rest.bands], axis=1),
         value=rest.value - lost,
         limit=rest.limit - lost,
         value_band=band,
-        revisits=len(path) - len(set(path)),
         risk=risk,
         blocked=driven.blocked,
     )

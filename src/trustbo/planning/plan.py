@@ -24,8 +24,6 @@ class Plan(Summary):
 
     Attributes:
         path: Cells from start to goal.
-        positions: CRS coordinates x and y of the cell centres, shape (cell, 2), in metres.
-        length: Length of the line through the cell centres, in metres.
         trust: Expected trust after each bound, shape (bound, robot).
         bands: Quantiles of expected trust over the parameter draws, shape (quantile, bound, robot),
             for the levels in `QUANTILES`. With one draw, the bands equal `trust`.
@@ -35,7 +33,6 @@ class Plan(Summary):
         exact: Whether the search proved that no admissible path is better.
         limit: Upper limit on the value of any admissible path. The limit equals `value` if `exact`
             is True, and is NaN if the path was given.
-        revisits: Number of bounds that enter a cell that the path has already visited.
         seconds: Duration of the search in seconds, without the compilation of kernels.
         workspace: Workspace of the path.
         risk: Failure probability of each bound, and arrival probability with its 90 % band; None if
@@ -55,15 +52,12 @@ class Plan(Summary):
     """
 
     path: tuple[Cell, ...]
-    positions: np.ndarray
-    length: float
     trust: np.ndarray
     bands: np.ndarray
     value: float
     objective: str
     exact: bool
     limit: float
-    revisits: int
     seconds: float
     workspace: Workspace
     risk: PathRisk | None = None
@@ -98,6 +92,23 @@ class Plan(Summary):
             rows.append(("search", f"{1e3 * self.seconds:.1f} ms"))
 
         return rows
+
+    @cached_property
+    def positions(self) -> np.ndarray:
+        """CRS coordinates x and y of the cell centres, shape (cell, 2), in metres."""
+        grid = self.workspace.grid
+        rows, cols = np.array(self.path).T
+        return np.stack([grid.x[cols], grid.y[rows]], axis=1)
+
+    @property
+    def length(self) -> float:
+        """Length of the line through the cell centres, in metres."""
+        return float(np.hypot(*np.diff(self.positions, axis=0).T).sum())
+
+    @property
+    def revisits(self) -> int:
+        """Number of bounds that enter a cell that the path has already visited."""
+        return len(self.path) - len(set(self.path))
 
     @property
     def p_fail(self) -> np.ndarray | None:
@@ -155,7 +166,7 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
     """Restore a plan of a workspace from a record made by `plan_to_record`."""
     values: dict[str, Any] = {**record, "workspace": workspace}
-    for name in ("positions", "trust", "bands"):
+    for name in ("trust", "bands"):
         values[name] = np.array(record[name])
 
     if record["value_band"]:

@@ -371,21 +371,14 @@ class Planner(Summary):
             low, high = np.quantile(values - cost, (QUANTILES[0], QUANTILES[-1])).tolist()
             value_band = low, high
 
-        grid = self.workspace.grid
-        rows, cols = cells.T
-        positions = np.stack([grid.x[cols], grid.y[rows]], axis=1)
-
         return Plan(
             path=path,
-            positions=positions,
-            length=float(np.hypot(*np.diff(positions, axis=0).T).sum()),
             trust=trust.mean(0),
             bands=bands,
             value=value - cost,
             objective=problem.objective.name,
             exact=False,
             limit=np.nan,
-            revisits=len(path) - len(set(path)),
             seconds=0.0,
             workspace=self.workspace,
             risk=None if problem.risk is None else problem.risk.along(cells),
