@@ -259,8 +259,8 @@ def test_numbers_of_numpy_become_python_s():
     assert robot == Robot(speed=1.5, acquire=2)
 
 
-@pytest.mark.parametrize("names", [(1, 2, 3), (None, 1.5, "c"), "abc"])
-def test_names_of_a_team_are_texts(names):
+@pytest.mark.parametrize("names", [(1, 2, 3), (None, 1.5, "c"), "abc", ("lead", "b", "c")])
+def test_names_of_a_team_are_texts_other_than_lead(names):
     with pytest.raises(TrustboError, match="names"):
         Team(3, names=names)
 
@@ -337,4 +337,7 @@ def test_contact_at_ticks_may_be_numbers():
     contact = np.array([[1, 0], [1, 1], [0, 0]])
     poses = np.zeros((3, 3, 3))
     bound = Bound((0, 1), unknown, unknown[:, 0], unknown[:, 0], poses=poses, contact=contact)
-    assert bound.contact is contact
+    np.testing.assert_array_equal(bound.contact, contact)
+    poses[...] = contact[...] = 1
+    assert not bound.poses.any()
+    assert not bound.contact[2].any()

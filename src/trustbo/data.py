@@ -122,6 +122,9 @@ class Bound:
         ticks = require_shares(self.contact_rate, self.n_ticks)
         object.__setattr__(self, "n_ticks", ticks)
         _require_recorded(len(self.awareness), self.poses, self.contact)
+        for name in ("poses", "contact"):
+            values = getattr(self, name)
+            object.__setattr__(self, name, None if values is None else np.array(values))
 
     def __repr__(self) -> str:
         rates = ", ".join(f"{rate:.3f}" for rate in self.contact_rate)

@@ -21,7 +21,7 @@ from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
 from trustbo.plots.style import drawing
-from trustbo.team import Team
+from trustbo.team import LEAD, Team
 
 __all__ = ["write_report"]
 __dir__ = __all__.copy  # tab completion lists only public names
@@ -366,7 +366,7 @@ def _settings(result: Result) -> _Section:
 
 def _about_team(team: Team) -> dict[str, str]:
     """Return the names, slope limits and lidar ranges of the robots, as texts."""
-    members = {"lead": team.lead} | dict(zip(team.names, team.robots, strict=True))
+    members = {LEAD: team.lead} | dict(zip(team.names, team.robots, strict=True))
     limits = {name: np.rad2deg(robot.max_slope) for name, robot in members.items()}
     ranges = {name: robot.lidar_range for name, robot in members.items()}
 

@@ -16,6 +16,9 @@ from trustbo.errors import (
     require_whole,
 )
 
+LEAD = "lead"
+"""Name of the lead T1 in tables and files."""
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -87,7 +90,8 @@ class Team(Summary):
         names: Names of the members of T2; by default r1, r2, ...
 
     Raises:
-        TrustboError: There are no robots, or `names` does not hold one distinct name per robot.
+        TrustboError: There are no robots, or `names` does not hold one distinct name per robot
+            other than `"lead"`.
 
     Example:
         >>> tb.Team(robots=(tb.Robot(lidar_range=60.0), tb.Robot()), names=("spot", "husky"))
@@ -105,6 +109,8 @@ class Team(Summary):
         robots = tuple(self.robots) or (Robot(),) * require_count("n_robots", self.n_robots)
         n = len(robots)
         names = as_names("names", self.names, n) or default_robots(n)
+        if LEAD in names:
+            raise TrustboError(f"names: {LEAD!r} is the name of the lead T1; choose another name.")
 
         object.__setattr__(self, "n_robots", n)
         object.__setattr__(self, "robots", robots)
@@ -121,7 +127,7 @@ class Team(Summary):
         return cls() if team is None else require_kind("team", team, Team, "give Team(n_robots=3)")
 
     def _rows(self) -> Rows:
-        members = {"lead": self.lead} | dict(zip(self.names, self.robots, strict=True))
+        members = {LEAD: self.lead} | dict(zip(self.names, self.robots, strict=True))
         limit = f"{np.rad2deg(self.max_slope):.3g} degrees"
         alike = "all alike" if len(set(members.values())) == 1 else "not all alike"
         return [("robots", f"{', '.join(self.names)} ({alike})"), ("slope limit", limit)]

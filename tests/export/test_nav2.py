@@ -132,7 +132,7 @@ def test_frames_off_the_map_and_other_objects_are_refused_before_any_file(result
 
 
 @pytest.mark.parametrize(
-    "name", ["/tb3_0", "../r1", "lead", "Lead", "-rf", " ", "r1 ", "r1.", "con", "CON.txt", "R2"]
+    "name", ["/tb3_0", "../r1", "Lead", "-rf", " ", "r1 ", "r1.", "con", "CON.txt", "R2"]
 )
 def test_names_of_robots_that_are_no_names_of_files_are_refused(name, result, tmp_path):
     other = copy.copy(result)

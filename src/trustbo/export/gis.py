@@ -16,10 +16,9 @@ from trustbo.files import FilePath, to_path, write_file, write_text
 from trustbo.logs.table import to_frame
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
+from trustbo.team import LEAD
 from trustbo.terrain.place import converted, quiet_affine
 
-LEAD = "lead"
-"""Name of the lead in exported files."""
 _NO_CRS = "this export needs a CRS; make the workspace with Workspace.from_terrain."
 _TIFF = (".tif", ".tiff")
 """Suffixes of a GeoTIFF."""

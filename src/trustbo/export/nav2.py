@@ -26,10 +26,10 @@ from trustbo.errors import (
     require_position,
     require_positive,
 )
-from trustbo.export.gis import LEAD
 from trustbo.files import FilePath, read_file, to_path, write_file
 from trustbo.planning import Plan
 from trustbo.planning.problem import mean_of
+from trustbo.team import LEAD
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
@@ -224,7 +224,7 @@ def _require_file_names(robots: Sequence[str]) -> None:
                 "'_' and '-', and begin with a letter or a digit."
             )
         other = seen.setdefault(name.casefold(), name)
-        if other != name or name == LEAD:
+        if other != name:
             raise TrustboError(
                 f"the files of the robots {other!r} and {name!r} would have one name; rename a "
                 "robot."
