@@ -304,8 +304,11 @@ def test_a_failure_without_rates_counts_until_a_user_excludes_it(workspace):
     campaign = begin(workspace)
     told = rates(workspace, DIAGONAL, fail_at=2)
     bounds = [replace(b, contact_rate=np.full(3, np.nan)) for b in told.bounds]
+    told = replace(told, bounds=tuple(bounds))
     with pytest.warns(UserWarning, match="excluded"):
-        campaign.tell(replace(told, bounds=tuple(bounds)))
+        campaign.tell(told)
+    with pytest.raises(tb.TrustboError, match="recorded already"):
+        campaign.tell(told)
     assert campaign.hazard["failures"].values.sum() == 1
     campaign.exclude(1, "")
     assert campaign.hazard["failures"].values.sum() == 0

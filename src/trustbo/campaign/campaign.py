@@ -545,8 +545,9 @@ class Campaign(Result):
 
     def _require_new(self, mission: Mission) -> None:
         """Raise TrustboError if a mission with the same data is recorded and not excluded."""
-        if not np.isfinite(mission.contact_rate).any():
-            return  # nothing can be learned twice
+        has_failed = any(status != "ok" for status in mission.statuses)
+        if not has_failed and not np.isfinite(mission.contact_rate).any():
+            return  # without rates and failures, missions on the same path are alike
 
         for n, entry in enumerate(self.state.entries, start=1):
             if entry.measured.has_same_data(mission) and not is_excluded_by_user(entry):
