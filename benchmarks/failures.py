@@ -82,7 +82,7 @@ def judged_plans(world, simulator, course, seed, given):
             )
         if number < max(ASKED):
             mission = simulator.run(plan.path, seed=campaign.state.seed_of("mission"))
-            campaign.tell(mission)
+            campaign.tell(mission, again=True)  # robots may get stuck in the same way twice
     return gathered
 
 
