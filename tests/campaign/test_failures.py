@@ -48,7 +48,7 @@ def at(bound):
 
 
 def price(campaign):
-    return campaign.planner.problem.price
+    return campaign.planner.problem.cost_of_failure
 
 
 def trapped(workspace, bound, path, seed):
@@ -158,9 +158,9 @@ def test_results_change_with_a_failure_and_price_it(hills):
     simulator, campaign = tb.simulation.KinematicSimulator(hills), begin(hills)
     campaign.tell(simulator.run(campaign.ask().path, seed=0))
     before = campaign.plan
-    assert campaign.planner.problem.price == 0.0
+    assert campaign.planner.problem.cost_of_failure == 0.0
     campaign.fail("stuck", where=campaign.ask().path[1])
-    assert campaign.planner.problem.price == campaign.planner.problem.paths.shortest
+    assert campaign.planner.problem.cost_of_failure == campaign.planner.problem.paths.shortest
     assert campaign.plan.value == campaign.recommend().value < before.value
 
 

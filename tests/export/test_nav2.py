@@ -92,7 +92,10 @@ def test_edges_cost_their_failures_after_the_first_one(tmp_path):
     ids = [row * workspace.grid.shape[1] + col for row, col in failed]
     found = [f["properties"] for f in features if f["properties"].get("startid") == ids[0]]
     [edge] = [one for one in found if one["endid"] == ids[1]]
-    graph, price = campaign.planner.graph(campaign.posterior), campaign.planner.problem.price
+    graph, price = (
+        campaign.planner.graph(campaign.posterior),
+        campaign.planner.problem.cost_of_failure,
+    )
     # A route graph does not know the next move.
     p_fail = np.nanmean(campaign.risk.mean[bounds_along(failed)[0][0], *failed[1]])
     assert edge["metadata"]["p_fail"] == pytest.approx(p_fail)

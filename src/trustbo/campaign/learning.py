@@ -239,7 +239,7 @@ def instead_of_failure(planner: Planner, plan: Plan, draws: Draws) -> Plan:
         draws: Parameter draws, under whose mean the safest path is evaluated.
     """
     problem = planner.problem
-    if problem.risk is None or not problem.price:
+    if problem.risk is None or not problem.cost_of_failure:
         return plan
     if problem.risk.failure(plan.path) <= _HOPELESS:
         return plan

@@ -378,12 +378,12 @@ def _graph(result: Result, frame: Frame) -> str:
         about = {"id": row * cols + col, "frame": frame.name, "metadata": {"row": row, "col": col}}
         features.append(_feature("Point", xy, about))
 
-    price = result.planner.problem.price
+    failure_cost = result.planner.problem.cost_of_failure
     for a, c, edge in graph.edges(data=True):
         move = MOVES.index((c[0] - a[0], c[1] - a[1]))
         first, last = (row * cols + col for row, col in (a, c))
         p_fail = -math.expm1(-edge.get("risk", 0.0))
-        cost = max(edge["lost"] + price * p_fail, _MIN_COST)
+        cost = max(edge["lost"] + failure_cost * p_fail, _MIN_COST)
 
         about = {"id": (1 + move) * n_cells + last, "startid": first, "endid": last, "cost": cost}
         about |= {"overridable": True, "metadata": {"penalty": cost, "p_fail": p_fail}}

@@ -102,7 +102,7 @@ class Problem:
             raise TrustboError(f"p_fail must have the shape {shape}; got {self.risk.p_fail.shape}.")
 
     @property
-    def price(self) -> float:
+    def cost_of_failure(self) -> float:
         """Cost of a failure in bounds; 0 without a risk or if contact is not the objective."""
         if self.risk is None or not self.objective.of_contact:
             return 0.0
@@ -156,10 +156,10 @@ class Problem:
         return objective.value((trust @ credit - bound_cost) / scale)
 
     def failure_along(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Compute the expected cost of failure: `price` times the failure probability of a path."""
-        if not self.risk or not self.price:
+        """Compute the expected cost of failure of a path, in bounds."""
+        if not self.risk or not self.cost_of_failure:
             return 0.0
-        return self.price * self.risk.failure(path)
+        return self.cost_of_failure * self.risk.failure(path)
 
     def costs_of_bounds(self, trust: np.ndarray, lost: np.ndarray) -> tuple[np.ndarray, float]:
         """Compute the costs of all bounds as if trust were not carried over; see `Planner.graph`.
@@ -177,7 +177,7 @@ class Problem:
         if self.objective.of_contact:
             if self.risk is None:
                 return lost, 0.0
-            return lost + self.price * np.nan_to_num(self.risk.of_bounds[bounds]), 0.0
+            return lost + self.cost_of_failure * np.nan_to_num(self.risk.of_bounds[bounds]), 0.0
 
         bound_cost = self.bound_cost[bounds]
         credit = self.objective.credit(np.arange(self.paths.longest + 1))
@@ -232,7 +232,7 @@ class Problem:
                 f"max_failure = {self.max_failure:g} needs the failure probability "
                 "of each bound; use planner.with_risk(p_fail)."
             )
-        if self.risk is None or (self.max_failure is None and self.price == 0.0):
+        if self.risk is None or (self.max_failure is None and self.cost_of_failure == 0.0):
             return None
 
         p_fail, weights = self._components
@@ -247,7 +247,7 @@ class Problem:
 
         limit = np.inf if self.max_failure is None else self.max_failure + ROUNDING
         risks = self.paths.paired.of_edges(risks_by_bound(p_fail))
-        return Risks(risks, self.price, weights, limit)
+        return Risks(risks, self.cost_of_failure, weights, limit)
 
     @property
     def _components(self) -> Components:
@@ -299,7 +299,7 @@ class Problem:
             sd=np.maximum(recursion.noise_sd, TINY_SD),
             bound_cost=bound_cost,
             risk=risks.of_edges,
-            failure=risks.price * risks.weights,
+            failure=risks.cost_of_failure * risks.weights,
             share=risks.weights,
             limit=risks.limit,
         )
@@ -375,11 +375,12 @@ class Risks(NamedTuple):
     `of_edges` (edge, component) contains the risks of the bounds that each edge of `paths.paired`
     completes, with one column per component of the risk. If the risks of a path add up to r_m in
     column m, it fails with probability sum_m w_m (1 - exp(-r_m)), where `weights` (component,)
-    contains the w_m. This probability must not exceed `limit`, and a failure costs `price`.
+    contains the w_m. This probability must not exceed `limit`, and a failure costs
+    `cost_of_failure`.
     """
 
     of_edges: np.ndarray
-    price: float
+    cost_of_failure: float
     weights: np.ndarray
     limit: float
 
