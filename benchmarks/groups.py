@@ -24,8 +24,8 @@ BASELINES = ("running mean", "residual process", "line of sight")
 KINDS = ("right", "wall", "bare", "slopes", "aged", "canopy", "shapes", "teams",
          "robots", "days", "foul", "change", "jammer", "physics", "limit")  # fmt: skip
 ALIKE = {
-    "map right": ("right", "slopes", "shapes", "teams"),
-    "map wrong": ("wall", "bare", "aged", "canopy"),
+    "map right": ("right", "wall", "bare", "slopes", "shapes", "teams"),
+    "map wrong": ("aged", "canopy"),
     "robots, weather, changes": ("robots", "days", "foul", "change"),
     "jammers and radio": ("jammer", "physics"),
     "wrong slope limit": ("limit",),
