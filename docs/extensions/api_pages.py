@@ -82,7 +82,7 @@ def description_of(name: str, value: object) -> list[str]:
 
 def write_index(app: Sphinx) -> None:
     """Write a table of all public names of all modules, in alphabetical order."""
-    rows = ["| name | module | |", "|---|---|---|"]
+    rows = ["| name | module | description |", "|---|---|---|"]
     for name, module in sorted(all_names(), key=lambda found: (found[0].lower(), found)):
         text = summary_of(module, name).replace("|", "\\|")
         rows.append(f"| {{py:obj}}`{name} <{module}.{name}>` | `{module}` | {text} |")
