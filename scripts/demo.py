@@ -2,8 +2,8 @@
 
     python scripts/demo.py [--out out/demo] [--picture FILE]
 
-The terrain is the hillside in the Wellington region in the package. Since the survey, 3 m of scrub have
-grown within 45 m of the middle of the first path. The output folder contains the campaign, its
+The terrain is the hillside in the package, in the Wellington region. Since the survey, 3 m of scrub
+have grown within 45 m of the middle of the first path. The output folder contains the campaign, its
 report, and maps and path for GIS. With `--picture`, the script also runs the campaign in a world
 where the map is right, finds the best path in both worlds, and draws the first figure of the docs.
 """

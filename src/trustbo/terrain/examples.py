@@ -19,9 +19,10 @@ _ORIGIN = 380_000.0, 5_225_000.0
 def example() -> xr.Dataset:
     """Read the example of real terrain that is included in the package.
 
-    It is a steep hillside under bush in the Wairarapa, Wellington region, New Zealand: 195 m x 278 m
-    at 1 m, 211 m of relief, trees up to 44.6 m tall. The attribute `attribution` states the source
-    and the licence; `LICENCE.md` beside the files says which part of this information is inferred.
+    It is a steep hillside under bush in the Wairarapa, New Zealand (Wellington region): 195 m x
+    278 m at 1 m, 211 m of relief, trees up to 44.6 m tall. The attribute `attribution` states the
+    source and the licence; `LICENCE.md` beside the files says which part of this information is
+    inferred.
     Robots need a slope limit of about 38 degrees or more; for robots with lower limits, use
     `synthetic_terrain`.
 
