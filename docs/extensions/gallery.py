@@ -132,7 +132,9 @@ def write_gallery(app: Sphinx) -> None:
         stamp.write_text(source)
 
     drawn = json.loads((FOLDER / "figures.json").read_text())
-    notebooks = [_notebook(path) for path in sorted((HERE.parent / "notebooks").glob("*.ipynb"))]
+    paths = sorted((HERE.parent / "notebooks").glob("*.ipynb"))
+    paths.sort(key=lambda path: path.stem != "quickstart")  # the quickstart first
+    notebooks = [_notebook(path) for path in paths]
     text = ["````{container} gallery", *(_figure(*entry) for entry in drawn), "````"]
     text += ["", "## Notebooks", "", _NOTEBOOKS, ""]
     text += ["````{container} gallery", *notebooks, "````", ""]
