@@ -138,7 +138,12 @@ class Columns:
                 or is not whole.
         """
         cells = self._cells(column, required)
-        parsed = pd.Series(pd.to_numeric(cells, errors="coerce")).to_numpy(float, na_value=np.nan)
+        parsed = pd.Series(pd.to_numeric(cells, errors="coerce"))
+        parsed = np.array(parsed.to_numpy(float, na_value=np.nan))
+
+        # Before pandas 3.1, the last digit of a number that is read from text may be wrong.
+        is_text = np.array([isinstance(cell, str) for cell in cells], bool) & np.isfinite(parsed)
+        parsed[is_text] = [float(cell) for cell in cells[is_text]]
 
         self.refuse(
             column,
