@@ -591,7 +591,7 @@ class Planner(Summary):
 
         maps = {
             "trust_mean": (trust.mean("draw"), "mean expected trust"),
-            "trust_sd": (trust.std("draw"), "sd of expected trust"),
+            "trust_sd": (trust.std("draw", skipna=False), "sd of expected trust"),
             "cost": (cost_of(trust).mean("draw"), "mean cost 1 - sigma(trust)"),
             "path_probability": (passable.copy(data=share), "P(cell on the best path)"),
         }
