@@ -229,7 +229,7 @@ def test_a_band_is_found_by_its_name_in_files_and_arrays(tmp_path):
     with rasterio.open(path, "r+") as file:
         file.descriptions = "DSM", "ground (DTM)"
         file.scales = 1.0, 0.9
-    with pytest.warns(UserWarning, match="Scales differ"):
+    with pytest.warns(UserWarning, match="(Scales|Offsets) differ"):
         from_rioxarray = rioxarray.open_rasterio(path)
     labelled = xr.concat([array(plane()), array(plane() + 9.0)], "band")
     labelled = labelled.assign_coords(band=["dem", "dsm"])[::-1]
@@ -271,7 +271,7 @@ def test_attributes_of_all_bands_are_those_of_the_chosen_band(tmp_path):
     with rasterio.open(path, "r+") as file:
         file.scales = 1.0, 0.1
         file.units = "ft", "m"
-    with pytest.warns(UserWarning, match="Scales differ"):
+    with pytest.warns(UserWarning, match="(Scales|Offsets) differ"):
         chosen = rioxarray.open_rasterio(path).sel(band=2)
     np.testing.assert_allclose(read_terrain(chosen, chosen)["dem"], plane(), rtol=1e-6)
 
