@@ -21,7 +21,7 @@ from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
 from trustbo.plots.style import drawing
-from trustbo.team import LEAD, Team
+from trustbo.team import Team
 
 __all__ = ["write_report"]
 __dir__ = __all__.copy  # tab completion lists only public names
@@ -366,15 +366,14 @@ def _settings(result: Result) -> _Section:
 
 def _about_team(team: Team) -> dict[str, str]:
     """Return the names, slope limits and lidar ranges of the robots, as texts."""
-    members = {LEAD: team.lead} | dict(zip(team.names, team.robots, strict=True))
-    limits = {name: np.rad2deg(robot.max_slope) for name, robot in members.items()}
-    ranges = {name: robot.lidar_range for name, robot in members.items()}
+    limits = {name: np.rad2deg(robot.max_slope) for name, robot in team.members.items()}
+    ranges = {name: robot.lidar_range for name, robot in team.members.items()}
 
     def listed(values: dict[str, float]) -> str:
         return ", ".join(f"{name} {value:.3g}" for name, value in values.items())
 
     return {
-        "robots": ", ".join(members),
+        "robots": ", ".join(team.members),
         "slope limits (degrees)": listed(limits),
         "lidar ranges (m)": listed(ranges),
     }

@@ -117,9 +117,14 @@ class Team(Summary):
         object.__setattr__(self, "names", names)
 
     @property
+    def members(self) -> dict[str, Robot]:
+        """The lead and then the members of T2, by name."""
+        return {LEAD: self.lead} | dict(zip(self.names, self.robots, strict=True))
+
+    @property
     def max_slope(self) -> float:
         """Steepest slope that every member withstands, rad."""
-        return min(robot.max_slope for robot in (self.lead, *self.robots))
+        return min(robot.max_slope for robot in self.members.values())
 
     @classmethod
     def of(cls, team: Self | None) -> Self:
@@ -127,7 +132,6 @@ class Team(Summary):
         return cls() if team is None else require_kind("team", team, Team, "give Team(n_robots=3)")
 
     def _rows(self) -> Rows:
-        members = {LEAD: self.lead} | dict(zip(self.names, self.robots, strict=True))
         limit = f"{np.rad2deg(self.max_slope):.3g} degrees"
-        alike = "all alike" if len(set(members.values())) == 1 else "not all alike"
+        alike = "all alike" if len(set(self.members.values())) == 1 else "not all alike"
         return [("robots", f"{', '.join(self.names)} ({alike})"), ("slope limit", limit)]

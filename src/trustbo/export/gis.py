@@ -16,7 +16,6 @@ from trustbo.files import FilePath, to_path, write_file, write_text
 from trustbo.logs.table import to_frame
 from trustbo.planning import Plan
 from trustbo.planning.plan import QUANTILES
-from trustbo.team import LEAD
 from trustbo.terrain.place import converted, quiet_affine
 
 _NO_CRS = "this export needs a CRS; make the workspace with Workspace.from_terrain."
@@ -103,15 +102,15 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     for about, place in zip(_cells(plan), centres, strict=True):
         features.append(_feature(plan, "bounds", place, about))
 
-    names = plan.workspace.team.names
+    team = plan.workspace.team
     for k, (cell, places) in enumerate(zip(plan.path, _of(plan.posts), strict=False), start=1):
-        for robot, place in zip(names, places, strict=True):
+        for robot, place in zip(team.names, places, strict=True):
             features.append(
                 _feature(plan, "posts", place, {"bound": k, "robot": robot, "cell": [*cell]})
             )
 
     for k, routes in enumerate(_of(plan.routes), start=1):
-        for robot, route in zip((LEAD, *names), routes, strict=True):
+        for robot, route in zip(team.members, routes, strict=True):
             if route is not None:
                 about = {"bound": k, "robot": robot, "length_m": shapely.LineString(route).length}
                 features.append(_feature(plan, "routes", route, about))

@@ -183,11 +183,12 @@ def write_nav2(
 
 def _waypoints(plan: Plan, frame: Frame, workspace: Workspace) -> dict[str, bytes]:
     """Return the content of each robot's file of waypoints; empty without a terrain."""
-    names = () if plan.stops is None else (LEAD, *workspace.team.names)
-    _require_file_names(names[1:])
+    if plan.stops is None:
+        return {}
+    _require_file_names(workspace.team.names)
 
     contents = {}
-    for robot in names:
+    for robot in workspace.team.members:
         poses = [_pose(frame.name, *pose) for pose in stops_of(plan, robot, frame).tolist()]
         contents[robot] = json.dumps({"poses": poses}, indent=1).encode()
     return contents
@@ -323,7 +324,7 @@ def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
     goal, they face the lead. Waypoints do not make robots wait for each other. Raises TrustboError
     if there is no terrain or no route.
     """
-    require_choice("robot", robot, (LEAD, *plan.workspace.team.names))
+    require_choice("robot", robot, plan.workspace.team.members)
     if plan.stops is None or plan.posts is None or plan.routes is None:
         raise TrustboError(_NO_WAYPOINTS)
 
