@@ -68,7 +68,7 @@ ARGUMENTS = {
     "update_subsample": lambda tree: az.update_subsample(
         subsampled(tree), tree, observations=3, log_lik_fn=likelihood, method="lpd"
     ),
-    "wasserstein": lambda tree: az.wasserstein(tree, tree, var_names=["b"]),
+    "wasserstein": lambda tree: az.wasserstein(tree, tree, var_names=["b"], num_samples=50),
     "weight_predictions": lambda tree: az.weight_predictions([tree, tree], weights=[0.5, 0.5]),
 }
 """Calls of functions that need more than a posterior."""
