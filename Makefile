@@ -12,7 +12,8 @@
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
-PYTEST := $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
+# A worker for each core, of which each takes up to 1.5 GB.
+PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist worksteal
 
 # Where a container's shell says so, Python would compile all modules anew at each start, 7 s.
 unexport PYTHONDONTWRITEBYTECODE
