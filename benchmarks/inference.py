@@ -3,9 +3,10 @@
     python benchmarks/inference.py [fits] [nuts] [paper] [memory] [busy] [filter]
 
 `fits`: CPU time of fits of the default model to 3, 15, 60 and 200 missions, and of fits with shared
-noise and with censored rates. A `later` fit starts from the posterior of the fit to one mission
-fewer, as in a campaign. The first fit of the process, to 3 missions, has its own row. Missions are
-on different random paths, or on 10 paths, as in a campaign that repeats its paths.
+noise, with censored rates, with counts of ticks and of `CoupledTrust`. A `later` fit starts from
+the posterior of the fit to one mission fewer, as in a campaign. The first fit of the process, to 3
+missions, has its own row. Missions are on different random paths, or on 10 paths, as in a campaign
+that repeats its paths.
 `nuts`: CPU time of `sampler="nuts"` for the default model and eight missions, with compilation, and
 the difference of the means from those of importance sampling.
 `accuracy`: errors of the posterior means of fits with 10 x --seeds seeds, in posterior standard
@@ -40,7 +41,7 @@ from trustbo.inference import TrustFilter, importance, sample_prior
 from trustbo.inference.density import Density
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.tree import parameters_alone
-from trustbo.models import PlaceEffect, PooledTrust, Priors, RobotEffect
+from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, Priors, RobotEffect
 from trustbo.models.backend import own_settings
 
 EFFECTS = (PlaceEffect(), RobotEffect())
@@ -48,6 +49,8 @@ EFFECTS = (PlaceEffect(), RobotEffect())
 DEFAULT = PooledTrust(effects=EFFECTS)
 SHARED = PooledTrust(effects=EFFECTS, shared_noise=True)
 CENSORED = PooledTrust(effects=EFFECTS, family="censored")
+COUNTS = PooledTrust(effects=EFFECTS, family="beta_binomial")
+COUPLED = CoupledTrust(effects=(RobotEffect(),))
 
 FITS = {
     "default model, 3 missions": (3, DEFAULT, None),
@@ -58,14 +61,19 @@ FITS = {
     "default model, 200 missions on 10 paths": (200, DEFAULT, 10),
     "shared noise, 15 missions": (15, SHARED, None),
     "censored rates, 15 missions": (15, CENSORED, None),
+    "counts of ticks, 15 missions": (15, COUNTS, None),
+    "CoupledTrust with robot effects, 15 missions": (15, COUPLED, None),
 }
 """Number of missions, model, and number of paths (None if all differ), by name."""
+
+N_TICKS = 40
+"""Number of ticks of each rate, if ticks are counted."""
 
 NAMES = ("beta0", "delta_w")
 """Parameters whose draws and means are compared in `paper`."""
 
 
-def missions(n, n_bounds=10, size=10, limit=False, seed=0, n_paths=None):
+def missions(n, n_bounds=10, size=10, limit=False, seed=0, n_paths=None, n_ticks=None):
     """Simulate missions of three robots on random walks, which repeat after `n_paths` missions."""
     rng, found = np.random.default_rng(seed), []
     for j in range(n):
@@ -79,7 +87,10 @@ def missions(n, n_bounds=10, size=10, limit=False, seed=0, n_paths=None):
         z = rng.uniform(size=(n_bounds, 3, 2))
         y = 0.2 + 0.5 * z[..., 0] + 0.1 * z[..., 1] + 0.08 * rng.standard_normal((n_bounds, 3))
         y = np.clip(1.6 * y - 0.3 if limit else y, 0.0, 1.0)
-        found.append(tb.Mission.from_arrays(path, z, y, features=["line_of_sight", "slope"]))
+        if n_ticks is not None:
+            y = np.round(n_ticks * y) / n_ticks
+        features = ["line_of_sight", "slope"]
+        found.append(tb.Mission.from_arrays(path, z, y, features=features, n_ticks=n_ticks))
     return found
 
 
@@ -113,7 +124,8 @@ def timed_fits(given):
 def one_case(table, name, n_seeds, later=False, label=""):
     """Add the row of a fit; if `later`, it starts from the posterior of one mission fewer."""
     n, model, n_paths = FITS[name]
-    data = missions(n, limit=model is CENSORED, n_paths=n_paths)
+    n_ticks = N_TICKS if model is COUNTS else None
+    data = missions(n, limit=model is CENSORED, n_paths=n_paths, n_ticks=n_ticks)
     options = {"latent": False, "check": False}
     if later:
         options["start"] = tb.fit(data[:-1], model, **options)
