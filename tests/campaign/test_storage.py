@@ -458,7 +458,7 @@ def test_missing_mission_before_others_is_named(folder, tmp_path):
 @pytest.mark.parametrize("name", ["workspace.nc", "missions/0002.nc", "posteriors/0004-1.nc"])
 def test_file_of_another_campaign_is_noticed(workspace, folder, tmp_path, name):
     copy = shutil.copytree(folder, tmp_path / "copy")
-    with begin(random_cells(2, 3), tmp_path / "other", seed=8) as other:
+    with begin(random_cells(3, 3), tmp_path / "other", seed=8) as other:
         drive(other)
     shutil.copy(tmp_path / "other" / name, copy / name)
     with pytest.raises(tb.TrustboError, match="replaced"):

@@ -329,7 +329,7 @@ def test_a_filter_reads_robots_and_features_by_name(missions):
     "cut",
     [
         lambda tree: tree.isel(chain=0),
-        lambda tree: tree.mean("draw"),
+        lambda tree: tree.mean("draw", keep_attrs=True),
         lambda tree: tree.isel(draw=slice(0, 0)),
     ],
     ids=["one chain", "means", "no draws"],

@@ -194,7 +194,7 @@ def test_maps_of_robots_are_the_mean_and_the_sd_over_draws(workspace, monkeypatc
     maps = planner.robot_maps(draws)
     assert maps["trust_mean"].dims == ("robot", "y", "x")
     np.testing.assert_allclose(maps["trust_mean"], trust.mean("draw"), rtol=1e-12)
-    np.testing.assert_allclose(maps["trust_sd"], trust.std("draw"), rtol=1e-9)
+    np.testing.assert_allclose(maps["trust_sd"], trust.std("draw", skipna=False), rtol=1e-9)
     np.testing.assert_allclose(maps["contact_rate"], rate.mean("draw"), rtol=1e-12)
     one = planner.trust(draws.mean())
     assert one.dims == ("robot", "row", "col")
