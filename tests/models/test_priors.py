@@ -1,6 +1,7 @@
 """Priors: the identity of the default ones, and their supports."""
 
 import copy
+import dataclasses
 import pickle
 import subprocess
 import sys
@@ -10,7 +11,9 @@ import numpyro.distributions as dist
 import pytest
 from scipy import special
 
+from trustbo.data import Mission
 from trustbo.errors import TrustboError
+from trustbo.inference import add_latent, fit
 from trustbo.models import HierarchicalTrust, HumanTrust, PooledTrust, Priors
 from trustbo.models.record import model_from_record, model_to_record
 from trustbo.models.scores import quantile
@@ -27,13 +30,45 @@ COPIES = {
 @pytest.mark.parametrize("family", ["gaussian", "beta_binomial"])
 def test_copies_of_a_model_keep_priors_by_feature(copied, family):
     model = copied(HierarchicalTrust(family=family))
-    expected = Priors.from_features(FEATURES, family).describe()
+    expected = Priors.from_features(FEATURES, family).in_order_of(FEATURES).describe()
     assert model.for_features(FEATURES).priors.describe() == expected
 
 
 def test_copies_of_own_priors_are_not_replaced():
     model = copy.deepcopy(PooledTrust(Priors()))
     assert model.for_features(FEATURES).priors.describe() == Priors().describe()
+
+
+def test_priors_of_named_features_follow_the_names():
+    priors = dataclasses.replace(Priors.from_features(FEATURES), x0_sd=0.2)
+    for features in (FEATURES, FEATURES[::-1]):
+        ordered = PooledTrust(priors).for_features(features).priors
+        mean, sd = ordered.moments("beta")
+        sight = features.index("line_of_sight")
+        assert (mean[sight], sd[sight]) == (1.0, 0.3)
+        assert (mean[1 - sight], sd[1 - sight]) == (0.0, 0.25)
+        assert ordered.x0_sd == 0.2
+
+
+def test_a_posterior_and_an_own_model_agree_on_named_features():
+    z = np.random.default_rng(0).uniform(size=(4, 2, 2))
+    missions = [Mission.from_arrays(None, z, 0.5 * z[..., 0], features=FEATURES[::-1])]
+    model = PooledTrust(dataclasses.replace(Priors.from_features(FEATURES), x0_sd=0.2))
+    posterior = fit(missions, model, draws=25, check=False, latent=False)
+    assert "loc=[1, 0]" in posterior.attrs["prior_beta"]
+    assert "log_likelihood" in add_latent(posterior, missions, model=model).children
+    record = model_to_record(model)
+    assert "visibility, line_of_sight" in record["priors"]["features"]
+    assert model_from_record(record, model) is model
+
+
+def test_priors_of_other_features_are_refused():
+    scalar = dataclasses.replace(Priors(), features=("a", "b", "c"))
+    for priors in (Priors.from_features(FEATURES), scalar):
+        with pytest.raises(TrustboError, match="the data have slope, canopy"):
+            PooledTrust(priors).for_features(("slope", "canopy"))
+    with pytest.raises(TrustboError, match="priors for 2 features, but there are 3"):
+        dataclasses.replace(Priors.from_features(FEATURES), features=("a", "b", "c"))
 
 
 THREADS = """

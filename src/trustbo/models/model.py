@@ -233,13 +233,17 @@ class TrustModel(Summary, ABC):
         return observations
 
     def for_features(self, features: Sequence[str]) -> Self:
-        """Return the model with default priors for these features, or with its custom priors.
+        """Return the model with its priors, or the default priors, for these features in order.
 
-        `fit` and campaigns call this method; see `Priors.from_features`.
+        `fit` and campaigns call this method; see `Priors.from_features`. Raises TrustboError if the
+        priors are for other features.
         """
-        if self.priors is not Priors.default(self.family):
-            return self
-        return replace(self, priors=Priors.from_features(tuple(features), self.family))
+        priors = self.priors
+        if priors is Priors.default(self.family):
+            priors = Priors.from_features(tuple(features), self.family)
+
+        priors = priors.in_order_of(features)
+        return self if priors is self.priors else replace(self, priors=priors)
 
     def program(self, observations: Observations) -> None:
         """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.

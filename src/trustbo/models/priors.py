@@ -69,10 +69,14 @@ class Priors(Summary):
         x0_sd: Standard deviation of trust before the first bound; 0 fixes trust at `x0_mean`.
         stationary: Whether `beta` and `b` are priors on beta / (1 - beta0) and b / (1 - beta0).
             These are the coefficients of stationary trust, the limit under constant features.
+        features: Names of the features of `beta`. Data with the same features in another order use
+            the priors by name, and data with other features are refused. If it is None, the priors
+            are in the order of the features of the data.
 
     Raises:
         TrustboError: If a prior has the wrong shape or support, the prior on a weight is not
-            Normal, or `concentration`, `x0_mean` or `x0_sd` is invalid.
+            Normal, `concentration`, `x0_mean` or `x0_sd` is invalid, or the number of `features`
+            is not that of the priors `beta`.
 
     Example:
         >>> priors = tb.models.Priors(beta0=dist.Beta(2.0, 4.0), beta=dist.Normal(0.0, 0.5))
@@ -91,6 +95,7 @@ class Priors(Summary):
     x0_mean: float = 0.5
     x0_sd: float = 0.5
     stationary: bool = False
+    features: Sequence[str] | None = None
 
     def _rows(self) -> Rows:
         return list(self.describe().items())
@@ -109,6 +114,11 @@ class Priors(Summary):
         }
         for name, number in numbers.items():
             object.__setattr__(self, name, number)
+
+        if self.features is not None:
+            features = require_list("Priors.features", self.features, str, "give a list of names")
+            object.__setattr__(self, "features", tuple(features))
+            self.coefficients(len(features))
 
     @classmethod
     def default(cls, family: str) -> "Priors":
@@ -143,7 +153,8 @@ class Priors(Summary):
         by 1 - beta0, the weights of these features have the prior N(1 / n, 0.3^2 / n), other
         weights have N(0, 0.25^2), and the intercept has N(0, 0.15^2). Most rates drawn from these
         priors are in [0, 1]. For tick counts, the priors are scaled by 5, and a line of sight of
-        0.5 predicts a rate of 0.5. If there is no such feature, `default` is returned.
+        0.5 predicts a rate of 0.5. If there is no such feature, `default` is returned, which is the
+        same for all features.
         """
         features = require_list("features", features, str, "give the names of the features")
         require_choice("family", family, FAMILIES)
@@ -162,6 +173,7 @@ class Priors(Summary):
                 beta=dist.Normal(slope * is_sight / n, slope * sd),
                 b=dist.Normal(-slope * zero, slope * _INTERCEPT_SD),
                 stationary=True,
+                features=features,
             )
 
     @classmethod
@@ -186,6 +198,28 @@ class Priors(Summary):
                 b=dist.Normal(slope * (_MIDDLE - zero), slope * _INTERCEPT_SD),
                 stationary=True,
             )
+
+    def in_order_of(self, features: Sequence[str]) -> "Priors":
+        """Return the same priors for data with these features in this order.
+
+        Raises TrustboError if the priors are for other features.
+        """
+        own = self.features
+        if own is None:
+            return self
+        if sorted(own) != sorted(features):
+            raise TrustboError(
+                f"the priors are for the features {', '.join(own)}, but the data have "
+                f"{', '.join(features)}; use Priors.from_features(features)."
+            )
+
+        beta = self.beta
+        if beta.batch_shape:
+            at = np.array([list(own).index(name) for name in features])
+            mean, sd = self.moments("beta")
+            with own_settings():
+                beta = dist.Normal(mean[at], sd[at])
+        return replace(self, beta=beta, features=None)
 
     def moments(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean and standard deviation of the Normal prior `name`."""
@@ -225,7 +259,11 @@ class Priors(Summary):
 
     def describe(self) -> dict[str, str]:
         """Describe each prior as text, for the record of a posterior."""
-        return {one.name: as_text(getattr(self, one.name)) for one in fields(self)}
+        names = [one.name for one in fields(self) if one.name != "features"]
+        described = {name: as_text(getattr(self, name)) for name in names}
+        if self.features is not None:
+            described["features"] = ", ".join(self.features)
+        return described
 
 
 def _wanted(name: str, prior: Any) -> str:

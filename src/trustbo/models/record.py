@@ -46,7 +46,7 @@ def model_from_record(
     # (the object itself, which stands for priors by feature), equal priors in another object,
     # `Priors.from_features` or `Priors.for_cells`.
     default = with_default_priors(record)
-    of_features = Priors.from_features(features, record["family"])
+    of_features = Priors.from_features(features, record["family"]).in_order_of(features)
     of_cells = Priors.for_cells(record["family"])
     for priors in (default.priors, replace(default.priors), of_features, of_cells):
         model = replace(default, priors=priors)
