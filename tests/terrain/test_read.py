@@ -27,6 +27,10 @@ HOLE = (2, 3)
 LARGEST = float(np.finfo("float32").max)
 
 
+EQUAL_CANOPY = pytest.mark.filterwarnings("ignore:the DSM lies")
+"""For canopies that have one height on purpose."""
+
+
 def plane(hole=None, dtype="float32", shape=(8, 10)):
     """Heights (row, col) of a plane, with a value in the hole if one is given."""
     row, col = np.mgrid[: shape[0], : shape[1]]
@@ -79,6 +83,7 @@ def tif(tmp_path):
     return write(tmp_path / "tif.tif", plane(np.nan))
 
 
+@EQUAL_CANOPY
 def test_a_pair_comes_out_aligned_north_up_and_in_metres(tmp_path):
     dem = write(tmp_path / "dem.tif", plane())
     dsm = write(tmp_path / "dsm.tif", plane() + 3.0)
@@ -100,6 +105,7 @@ def test_paths_and_arrays_are_read_alike(tif):
             assert_is_the_plane(read_terrain(source, source))
 
 
+@EQUAL_CANOPY
 def test_a_coarser_shifted_dsm_is_brought_onto_the_dem_s_grid(tmp_path):
     dem = write(tmp_path / "dem.tif", plane(shape=(40, 40)))
     row, col = np.mgrid[:30, :30]
@@ -224,6 +230,7 @@ def test_pictures_are_refused_and_several_bands_are_warned_of(tmp_path):
         assert_is_the_plane(read_terrain(two, two))
 
 
+@EQUAL_CANOPY
 def test_a_band_is_found_by_its_name_in_files_and_arrays(tmp_path):
     path = write(tmp_path / "both.tif", plane() + 9.0, plane())
     with rasterio.open(path, "r+") as file:
@@ -338,6 +345,22 @@ def test_a_surface_higher_than_any_forest_everywhere_is_warned_of(surface):
         read_terrain(array(plane()), array(surface))
 
 
+@pytest.mark.parametrize("shift", [0.5, 1.5, 15.0])
+def test_a_surface_that_is_shifted_upwards_is_warned_of(shift):
+    with_trees = plane() + shift
+    with_trees[:, :4] += np.linspace(2.0, 9.0, 8)[:, None]
+    with pytest.warns(UserWarning, match=f"{shift:.3g} m above the DEM on 60%"):
+        read_terrain(array(plane()), array(with_trees))
+
+
+def test_a_forest_without_a_gap_and_rounded_open_ground_are_not_warned_of():
+    rng = np.random.default_rng(0)
+    forest = plane(dtype=float) + rng.uniform(1.0, 20.0, (8, 10))
+    read_terrain(array(plane()), array(forest))
+    rounded = plane(dtype=float) + rng.uniform(-0.05, 0.05, (8, 10))
+    assert float(read_terrain(array(plane()), array(rounded))["dsm"].mean()) > plane().mean()
+
+
 def test_a_surface_below_the_ground_is_raised_and_counted():
     surface = plane() + 1.0
     surface[:, :2] -= 2.0
@@ -417,6 +440,7 @@ def test_rasters_without_a_place_are_refused(tmp_path):
         read_terrain(array(plane()).drop_vars(["x", "y"]))
 
 
+@EQUAL_CANOPY
 def test_degrees_are_warped_to_the_local_utm_zone():
     degrees = array(plane(shape=(60, 60)), "EPSG:4326", 1e-5, 15.0, 45.0)
     terrain = read_terrain(degrees, degrees + 2.0)
@@ -527,6 +551,7 @@ def test_half_of_a_mosaic_at_zero_is_warned_of_and_level_ground_is_not():
         read_terrain(array(level), array(level))
 
 
+@EQUAL_CANOPY
 def test_ground_that_the_surface_does_not_cover_is_warned_of():
     surface = plane(dtype=float) + 2.0
     surface[:, 5:] = np.nan

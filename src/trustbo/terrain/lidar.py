@@ -15,7 +15,7 @@ from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import HIGHEST, LOWEST
 from trustbo.terrain.place import require_map, vertical_axis
-from trustbo.terrain.read import check_size, read_terrain
+from trustbo.terrain.read import check_size, require_terrain
 
 _GROUND_GAP = 10.0
 """Maximum distance of a pixel to one with ground points, m."""
@@ -88,8 +88,8 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
     surface = dem + canopy
     ground = np.where(np.isfinite(surface), dem, np.nan)
 
-    maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (ground, surface))
-    return read_terrain(*(z.rio.write_crs(own.to_string()) for z in maps))
+    maps = {"dem": (("y", "x"), ground), "dsm": (("y", "x"), surface)}
+    return require_terrain(xr.Dataset(maps, {"y": y, "x": x}).rio.write_crs(own.to_string()))
 
 
 def _read_points(path: str, given: object) -> tuple[np.ndarray, np.ndarray, CRS]:

@@ -39,6 +39,11 @@ from trustbo.terrain.place import (
 
 MOST_PIXELS = 1e8  # per raster: about 3 GB while it is read
 _CLIPPED = 0.02  # fraction of pixels with the surface below the ground that causes a warning
+_NOISE = 0.1  # m: a surface that is less than this below the ground is due to resampling
+_LOWEST = 0.02  # quantile of the canopy height that counts as its lowest value
+_SHIFTED = 0.3  # m: a higher lowest value may be due to a vertical shift
+_LEVEL = 0.3  # m above the lowest value within which canopy heights count as equal to it
+_EQUAL = 0.3  # fraction of equal canopy heights above which a vertical shift is likely
 _UNCOVERED = 0.02  # fraction of the DEM without a surface that causes a warning
 _COARSER = 2.0  # ratio of pixel sizes from which the coarser raster smooths the heights
 _TILES = "to read tiles as one raster, combine them: gdalbuildvrt -srcnodata -9999 all.vrt *.tif"
@@ -100,6 +105,8 @@ def read_terrain(
     terrain = _on_one_grid(stored, crs, nodata)
     if dsm is None:
         warn("no surface (DSM) is given, so no canopy is known: only the ground blocks sight.")
+    else:
+        _warn_of_shift(terrain)
     return terrain if resolution is None else _averaged(terrain, resolution)
 
 
@@ -426,7 +433,7 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray, sides: tuple[float, flo
         )
 
     canopy = (dsm - dem)[valid]
-    if (share := (canopy < 0.0).mean()) > _CLIPPED:
+    if (share := (canopy < -_NOISE).mean()) > _CLIPPED:
         check = "both have the same vertical datum and that they are not swapped"
         if max(sides) >= _COARSER * min(sides):
             check = (
@@ -449,6 +456,21 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray, sides: tuple[float, flo
     masked = {name: np.where(valid, z, np.nan) for name, z in heights.items()}
     maps = {name: (("y", "x"), z, {"units": "m"}) for name, z in masked.items()}
     return xr.Dataset(maps, {axis: ground[axis].values for axis in ("y", "x")})
+
+
+def _warn_of_shift(terrain: xr.Dataset) -> None:
+    """Warn if the DSM seems to be shifted upwards: in a forest, canopy heights are not so equal."""
+    canopy = (terrain["dsm"] - terrain["dem"]).values
+    canopy = canopy[np.isfinite(canopy)]
+
+    lowest = np.quantile(canopy, _LOWEST)
+    share = (canopy < lowest + _LEVEL).mean()
+    if _SHIFTED < lowest <= _RAISED and share > _EQUAL:
+        warn(
+            f"the DSM lies {lowest:.3g} m above the DEM on {share:.0%} of pixels, and nearly "
+            "nowhere lower: check that both have the same vertical datum. Open ground at this "
+            "height would count as canopy and block sight."
+        )
 
 
 def _averaged(terrain: xr.Dataset, resolution: float) -> xr.Dataset:
