@@ -4,6 +4,7 @@ import functools
 import os
 import subprocess
 import sys
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -722,6 +723,52 @@ def with_global_prior(awareness, contact_rate=None):
     a = numpyro.sample("a", PRIOR)
     rates = ContactRate(a + 0.0 * awareness[..., 0], 0.4, 0.05, 0.05)
     numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+class Saturating:
+    """A function with a setting beside attributes that cannot be pickled."""
+
+    def __init__(self, steepness):
+        self.steepness = steepness
+        self.link = jnp.tanh
+        self.lock = threading.Lock()
+        self.own = self
+
+    def __call__(self, awareness, contact_rate=None):
+        return self.link(self.steepness * awareness)
+
+    def method(self, awareness, contact_rate=None):
+        return self(awareness)
+
+
+class Slotted:
+    __slots__ = ("link", "steepness")
+
+    def __init__(self, steepness):
+        self.steepness = steepness
+        self.link = jnp.tanh
+
+    def __call__(self, awareness, contact_rate=None):
+        return self.link(self.steepness * awareness)
+
+
+@pytest.mark.parametrize(
+    "of",
+    [Saturating, Slotted, lambda steepness: Saturating(steepness).method],
+    ids=["call", "slots", "method"],
+)
+def test_attributes_that_cannot_be_pickled_do_not_hide_the_others(of):
+    assert fingerprint(of(1.0)) == fingerprint(of(1.0)) != fingerprint(of(20.0))
+
+
+def test_an_object_that_changes_changes_its_fingerprint():
+    model = Saturating(1.0)
+    before = fingerprint(model)
+    model.steepness = 20.0
+    assert fingerprint(model) != before
+    model.steepness = 1.0
+    model.link = jnp.sin
+    assert fingerprint(model) != before
 
 
 def test_globals_that_change_change_the_fingerprint(monkeypatch):

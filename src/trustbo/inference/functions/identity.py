@@ -209,7 +209,7 @@ def _describe_object(value: Any, parts: list[str], seen: dict[int, int]) -> None
 
 
 def _describe_other(value: Any, parts: list[str], seen: dict[int, int]) -> None:
-    """Describe a value that can be pickled; other values are identified only by their kinds.
+    """Describe a value by its pickle or, if it cannot be pickled, by its attributes.
 
     Pickle refers to the class of an object by name, so the code of `__call__` is added.
     """
@@ -218,11 +218,45 @@ def _describe_other(value: Any, parts: list[str], seen: dict[int, int]) -> None:
         _Pickler(content, protocol=_PROTOCOL).dump(value)
         parts.append(hashlib.sha256(content.getvalue()).hexdigest())
     except Exception:
-        parts.append(_kind_of(value))
+        _describe_attributes(value, parts, seen)
 
     call = getattr(type(value), "__call__", None)  # noqa: B004
     if inspect.isfunction(call):
         _describe(call, parts, seen)
+
+
+def _describe_attributes(value: Any, parts: list[str], seen: dict[int, int]) -> None:
+    """Describe an object by its class and attributes; without attributes, such as a lock, by class.
+
+    An attribute that cannot be pickled, such as `jnp.tanh` or a lambda, must not hide the others.
+    """
+    if id(value) in seen:  # an object that refers to itself
+        parts.append(f"object {seen[id(value)]}")
+        return
+
+    seen[id(value)] = len(seen)
+    parts.append(_kind_of(value))
+    cached = _cached_names(type(value))
+    attributes = {name: one for name, one in _attributes_of(value).items() if name not in cached}
+    _describe(attributes, parts, seen)
+
+
+def _attributes_of(value: Any) -> dict[str, Any]:
+    """Return the attributes of an object by name, including those in slots."""
+    slots = [getattr(kind, "__slots__", ()) for kind in type(value).__mro__]
+    names = [name for some in slots for name in ([some] if isinstance(some, str) else some)]
+    of_slots = {name: getattr(value, name) for name in sorted(names) if hasattr(value, name)}
+    return {**of_slots, **getattr(value, "__dict__", {})}
+
+
+def _cached_names(kind: type) -> set[str]:
+    """Return the names of the attributes in which a class caches properties."""
+    return {
+        name
+        for base in kind.__mro__
+        for name, one in vars(base).items()
+        if isinstance(one, functools.cached_property)
+    }
 
 
 class _Pickler(pickle.Pickler):
@@ -242,12 +276,7 @@ class _Pickler(pickle.Pickler):
         if isinstance(value, xr.DataArray | xr.Dataset):
             return dict, (value.to_dict(data="array"),)
 
-        cached = {
-            name
-            for kind in type(value).__mro__
-            for name, one in vars(kind).items()
-            if isinstance(one, functools.cached_property)
-        }
+        cached = _cached_names(type(value))
         if not cached:
             return NotImplemented
 
