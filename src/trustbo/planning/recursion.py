@@ -95,9 +95,12 @@ def trust_recursion(
     if not draws.carried:
         transition = np.zeros_like(transition)
 
-    start = np.asarray(draws.x0_mean if x0 is None else x0, dtype=float)
-    if x0 is None or not start.ndim:
-        start = start[..., None]
+    if x0 is not None:
+        start = np.asarray(x0, dtype=float)
+    elif draws.carried:  # the robots of a NumPyro function may differ
+        start = of_draws(space.initial_mean.reshape(len(space.initial_mean), -1))
+    else:
+        start = np.asarray(draws.x0_mean, dtype=float)[..., None]
 
     try:
         start = np.broadcast_to(start, (*leading, n_robots))
