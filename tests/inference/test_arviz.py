@@ -9,8 +9,11 @@ import numpyro.distributions as dist
 import pytest
 import xarray as xr
 from arviz_base.base import make_attrs
+from scipy import stats
 
 import trustbo as tb
+from trustbo.inference import add_latent
+from trustbo.inference.tree import parameters_alone
 from trustbo.models import CoupledTrust, HierarchicalTrust, PooledTrust, Priors
 
 FEATURES = ("traversability", "line_of_sight")
@@ -131,3 +134,26 @@ def test_rows_of_a_summary_are_labelled_rightly_in_any_order_of_names(missions, 
             name, place = label.rstrip("]").split("[")
             where = dict(zip(draws[name].dims[2:], place.split(", "), strict=True))
             assert draws[name].isel(chain=0, draw=0).sel(where).item() == pytest.approx(value)
+
+
+@pytest.mark.parametrize("model", [tb.models.default_model(), tb.models.CoupledTrust()])
+def test_draws_of_the_prior_and_of_its_predictions_belong_together(model):
+    """As for the posterior, with one rate and thus nearly the prior."""
+    z = np.random.default_rng(0).uniform(size=(6, 2, 1))
+    rates = np.full((6, 2), np.nan)
+    rates[0, 0] = 0.5
+    missions = [tb.Mission.from_arrays([(0, k) for k in range(7)], z, rates)]
+    posterior = tb.fit(missions, model, check=False, progress=False)
+
+    b = posterior["prior"]["b"]
+    b = b.mean([dim for dim in b.dims if dim not in ("chain", "draw")])
+    predicted = posterior["prior_predictive"]["contact_rate"].mean(("mission", "bound", "robot"))
+    assert stats.spearmanr(b.values.ravel(), predicted.values.ravel()).statistic > 0.3
+
+    part = posterior.isel(draw=slice(100, None, 3))
+    again = add_latent(parameters_alone(part), missions)
+    for name in ("chain", "draw"):
+        assert again["prior_predictive"][name].equals(again["prior"][name])
+
+    del part["prior"]
+    assert add_latent(parameters_alone(part), missions)["prior_predictive"].sizes["draw"] == 500

@@ -115,6 +115,14 @@ def test_a_posterior_has_the_groups_of_a_model_class(posterior, missions):
         assert posterior[group].to_dataset().sizes.keys() == ours[group].to_dataset().sizes.keys()
 
 
+def test_rates_are_predicted_from_the_draws_of_the_prior(posterior, missions):
+    z = np.nanmean([mission.awareness.mean((0, 1)) for mission in missions], axis=0)
+    prior = posterior["prior"]
+    drift = prior["level"].values + prior["weight"].values @ z
+    predicted = posterior["prior_predictive"]["contact_rate"].mean(("mission", "bound", "robot"))
+    assert stats.spearmanr(drift.ravel(), predicted.values.ravel()).statistic > 0.8
+
+
 def test_log_likelihoods_are_those_of_numpyro(posterior, missions):
     z = np.concatenate([mission.awareness for mission in missions[:1]])[None]
     y = missions[0].contact_rate[None]
@@ -134,6 +142,22 @@ def test_latent_trust_follows_the_rates(posterior, missions):
         rates = mission.contact_rate
         trust = posterior["latent"]["trust_mean"].values[j, : len(rates)]
         assert np.nanmax(np.abs(trust - rates)) < 0.2
+
+
+def test_plans_start_from_the_trust_of_each_robot(workspace):
+    start, beta0 = np.array([1.0, 0.5, 0.0]), np.array([0.95, 0.5, 0.1])
+
+    def model(awareness, contact_rate=None):
+        w = numpyro.sample("w", dist.Normal(0.1, 1e-6))
+        with numpyro.plate("mission", len(awareness)):
+            rates = ContactRate(w * awareness[..., 0], jnp.asarray(beta0), 0.01, 0.01, start, 0.01)
+            numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    plan = tb.Campaign(workspace, (4, 0), (0, 4), model=model, progress=False).ask()
+    trust = start
+    for k, z in enumerate(np.asarray(workspace.along(plan.path))):
+        trust = beta0 * trust + 0.1 * z[:, 0]
+        np.testing.assert_allclose(plan.trust[k], trust, atol=1e-5)
 
 
 def test_draws_plan_like_the_parameters_of_a_model_class(posterior, workspace):

@@ -58,10 +58,13 @@ def require_posterior(who: str, value: object) -> xr.DataTree:
     return value
 
 
-def parameters_of(posterior: xr.DataTree, model: TrustModel | None = None) -> dict[str, np.ndarray]:
+def parameters_of(
+    posterior: xr.DataTree, model: TrustModel | None = None, group: str = "posterior"
+) -> dict[str, np.ndarray]:
     """Return the parameter draws of a posterior by name, with chains joined in an axis (draw,).
 
-    Variables that are not in the model, such as those added by a user, are left out.
+    The group is `posterior` or `prior`. Variables that are not in the model, such as those added by
+    a user, are left out.
 
     Raises:
         TrustboError: If the dims of a parameter differ from the model's, or if a draw is NaN, for
@@ -70,7 +73,7 @@ def parameters_of(posterior: xr.DataTree, model: TrustModel | None = None) -> di
     if model is None:
         model = model_of(posterior)
     axes = model.dims | model.effect_dims
-    draws = posterior["posterior"].to_dataset()
+    draws = posterior[group].to_dataset()
 
     parameters = {}
     for name in map(str, draws):

@@ -14,7 +14,7 @@ from trustbo.inference.draws import (
     parameters_of,
 )
 from trustbo.inference.latent import Latent, latent_of, replicate
-from trustbo.inference.variables import draw_prior
+from trustbo.inference.variables import prior_parameters, with_prior_effects
 from trustbo.models.effects.effect import Effect
 from trustbo.models.observations import Observations
 from trustbo.models.scores import log_density
@@ -203,7 +203,11 @@ def with_latent(
         latent = latent_of(fitted, draws, some, stream(seed, "latent"))
 
     rng = stream(seed, "prior predictive")
-    replicated = replicate(fitted, draw_prior(fitted, N_PRIOR, rng), rng)
+    if "prior" in posterior.children:
+        prior = parameters_of(posterior, group="prior")
+    else:  # the user has dropped it
+        prior = prior_parameters(fitted, N_PRIOR, rng)
+    replicated = replicate(fitted, with_prior_effects(fitted, prior, rng), rng)
 
     # Log likelihoods of tick counts are comparable between families. They are NaN where ticks are
     # unknown.
@@ -234,7 +238,8 @@ def add_groups(
         posterior: DataTree with the parameters.
         missions: Fitted missions.
         latent: Trust, likelihoods and predictions, with chains joined.
-        replicated: Rates (draw, mission, bound, robot) drawn from the prior.
+        replicated: Rates (draw, mission, bound, robot), one draw for each draw of the group
+            `prior`.
         densities: Log prior densities (draw,) by name, with chains joined.
         of_counts: Whether the log-likelihoods are of tick counts.
     """
@@ -263,11 +268,15 @@ def add_groups(
     # The draws have the labels of the posterior, which may be part of a longer one.
     kept, _ = kept_draws(posterior)
     some = labels | {"draw": labels["draw"][kept]}
+    prior = {}
+    if "prior" in posterior.children:
+        prior = {name: posterior["prior"][name].values for name in ("chain", "draw")}
     for name, of_draws in (
         ("log_likelihood", labels),
         ("log_prior", labels),
         ("latent", some),
         ("posterior_predictive", some),
+        ("prior_predictive", prior),
     ):
         datasets[name] = datasets[name].assign_coords(of_draws)
 

@@ -22,25 +22,37 @@ def to_variables(density: Density, draws: JointDraws) -> dict[str, dict[str, np.
 
 def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -> JointDraws:
     """Make draws from variables by group and name, as returned by `to_variables`."""
-    parameters = groups["posterior"]
-    model = density.model
-    theta = model.derived(
-        {n: parameters[n] for n in model.dims | model.effect_dims if n in parameters}
-    )
-    theta = {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
-
+    theta = _theta_of(density, groups["posterior"])
     c = [
         effect.coefficients(groups[effect.group or "posterior"], theta, density.observations)
-        for effect in model.terms
+        for effect in density.model.terms
     ]
     return JointDraws(theta, np.column_stack(c))
 
 
-def draw_prior(density: Density, n: int, rng: np.random.Generator) -> JointDraws:
-    """Draw hyperparameters and coefficients from the prior."""
-    theta = density.model.theta(density.scores.draw(n, rng), density.observations.resolution)
-    c = [density.prior(chunk).draw(rng) for _, chunk in chunks(theta)]
-    return JointDraws(theta, np.concatenate(c))
+def with_prior_effects(
+    density: Density, parameters: Mapping[str, np.ndarray], rng: np.random.Generator
+) -> JointDraws:
+    """Draw the effects from their prior given prior draws of the parameters, by name."""
+    theta = _theta_of(density, parameters)
+    observations = density.observations
+    model = density.model
+
+    weights = model.weights.coefficients(parameters, theta, observations)
+    parts = []
+    for where, chunk in chunks(theta):
+        groups = [effect.prior(chunk, observations) for effect in model.effects]
+        of_effects = Prior.from_groups(groups).draw(rng) if groups else weights[where, :0]
+        parts.append(of_effects)
+    return JointDraws(theta, np.column_stack([weights, np.concatenate(parts)]))
+
+
+def _theta_of(density: Density, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the hyperparameters of draws by name; see `Theta`."""
+    model = density.model
+    names = model.dims | model.effect_dims
+    theta = model.derived({name: parameters[name] for name in names if name in parameters})
+    return {name: v for name, v in theta.items() if name not in ("beta", "b", "B")}
 
 
 def prior_parameters(

@@ -68,6 +68,8 @@ _MOST_ATTEMPTS = 10
 """Largest number of runs, however short."""
 _MANY = 4000
 """Total number of draws per chain, over all runs, before bad diagnostics are reported."""
+_OF_PRIOR = 2
+"""Offset of the seed of the draws in the groups `prior` and `prior_predictive`."""
 _SIZE = 200
 """Number of draws for which latent trust is drawn at once."""
 
@@ -212,6 +214,8 @@ def with_latent_of_function(
     sd = np.sqrt(np.maximum(square - mean**2, 0.0))
     latent = Latent(trust, mean, sd, log_likelihood, predicted)
     replicated = _prior_predictive(model, data, observations, seed)
+    if "prior" in posterior.children:  # some of its draws may have been selected
+        replicated = replicated[posterior["prior"].to_dataset()["draw"].values]
     densities = {name: np.concatenate(parts) for name, parts in log_prior.items()}
     of_counts = of_counts and _all_counted(observations)
     return add_groups(posterior, missions, latent, replicated, densities, of_counts=of_counts)
@@ -634,7 +638,7 @@ def _prior_predictive(
     model: FunctionModel, data: Data, observations: Observations, seed: int
 ) -> np.ndarray:
     """Draw rates (draw, mission, bound, robot) of the missions from the prior."""
-    keys = _keys(N_PRIOR, seed + 1)
+    keys = _keys(N_PRIOR, seed + _OF_PRIOR)
     values = model.over_draws("prior", 1, data)(keys)
     found: Found = model.over_draws("evaluate", 2, data)(values, keys)
     n_missions, n_bounds = observations.contact_rate.shape[:2]
@@ -658,7 +662,7 @@ def _tree(
     """
     computed = model.computed_sites(data)
     stored = {**sites, **computed}
-    prior = model.over_draws("prior", 1, data)(_keys(N_PRIOR, seed + 2))
+    prior = model.over_draws("prior", 1, data)(_keys(N_PRIOR, seed + _OF_PRIOR))
 
     def by_chain(values: Mapping[str, np.ndarray], shape: tuple[int, ...]) -> dict[str, Any]:
         whole = {**values, **_computed(model, values, computed, data)}
