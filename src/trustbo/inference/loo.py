@@ -45,6 +45,8 @@ _CHAINS = 4
 _FEWEST = 4
 """Number of missions below which each one is left out by a refit, because weights would be
 optimistic."""
+_FEWEST_OF_CLASS = 10
+"""The same number for model classes, whose refits take about a second."""
 _LEAST_EFFECTIVE = 2.0
 """Smallest effective number of draws that is used to compute the limit of k-hat."""
 
@@ -70,6 +72,8 @@ class LeftOut(NamedTuple):
     """Effective number of draws."""
     efficiency: float
     """Effective draws per draw of a Markov chain; 1 for independent draws."""
+    fewest: int
+    """Number of missions below which each one is left out by a refit."""
     refit: Callable[[int], tuple[float, float]] | None
     """Function that returns log p(y_j | y_-j) and its k-hat from a fit without mission j, or None
     if refits are not possible."""
@@ -82,8 +86,10 @@ def loo(posterior: xr.DataTree, *, model: Model | None = None, progress: bool = 
     Posterior draws get Pareto-smoothed weights. For a model class, all variables except
     hyperparameters are integrated out, by expectation propagation if rates are not Gaussian. If the
     k-hat of a mission exceeds min(1 - 1 / log10(S), 0.7) for S effective draws (Vehtari et al.
-    2024), or if there are fewer than four missions, the model is refitted without that mission.
-    Missions without measured rates are excluded.
+    2024), the model is refitted without that mission. With fewer than ten missions, a model class
+    is refitted without each mission, because weights are then optimistic even if k-hat is good; a
+    NumPyro function, whose refits are slow, with fewer than four. Missions without measured rates
+    are excluded.
 
     With few missions, the sum `elpd` is uncertain even if k-hat is good; see `compare`. `p`, the
     effective number of parameters, should be much smaller than `n_data_points`, the number of
@@ -149,7 +155,7 @@ def estimated(target: LeftOut, *, progress: bool = True) -> ELPDData:
             density[i] = logsumexp(log_p, b=weight)
             average[i] = logsumexp(target.log_likelihood[:, j]) - np.log(n_samples)
 
-            if n_measured < _FEWEST or not k_hat[i] <= limit:
+            if n_measured < target.fewest or not k_hat[i] <= limit:
                 if target.refit is None:
                     raise TrustboError(_no_refit(labels[i], k_hat[i], limit, n_measured))
                 bar.set_description_str(f"loo, refit without mission {labels[i]}")
@@ -255,6 +261,7 @@ def _of_class(posterior: xr.DataTree, model: Model | None) -> LeftOut:
         log_share=np.log(share),
         n_effective=min(1.0 / float((share**2).sum()), _n_effective(posterior)),
         efficiency=1.0,
+        fewest=_FEWEST_OF_CLASS,
         refit=refit,
     )
 
@@ -317,6 +324,7 @@ def _of_function(posterior: xr.DataTree, model: FunctionModel) -> LeftOut:
         log_share=np.full(n_draws, -np.log(n_draws)),
         n_effective=n_effective,
         efficiency=n_effective / n_draws,
+        fewest=_FEWEST,
         refit=refit,
     )
 
@@ -387,5 +395,6 @@ def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
         log_share=np.full(n_draws, -np.log(n_draws)),
         n_effective=n_effective,
         efficiency=n_effective / n_draws,
+        fewest=_FEWEST,
         refit=None,
     )
