@@ -1,15 +1,18 @@
 """Grids of campaigns: what a row says, processes, and going on after a failure or a kill."""
 
+import dataclasses
 import os
 import types
 from functools import partial
 
 import numpy as np
+import numpyro.distributions as dist
 import pandas as pd
 import pytest
 
 import trustbo as tb
 from trustbo.errors import TrustboError
+from trustbo.models.backend import VERSIONS
 from trustbo.simulation import Truth
 from trustbo.study import Scene, run_grid
 
@@ -73,12 +76,118 @@ def test_regret_is_that_of_the_campaign_itself(table):
     np.testing.assert_allclose(run["regret"], expected, atol=1e-9)
 
 
-def test_called_again_it_reads_what_is_there(table, folder):
-    def broken():
-        raise RuntimeError
-
-    again = run_grid(CASES, dict.fromkeys(SCENES, broken), folder, seeds=(0, 1), n_missions=2)
+def test_called_again_it_reads_what_is_there(table, folder, monkeypatch):
+    """Without making the scenes again."""
+    monkeypatch.setattr(tb.Workspace, "from_awareness", None)
+    again = run_grid(CASES, SCENES, folder, seeds=(0, 1), n_missions=2)
     pd.testing.assert_frame_equal(again, table)
+
+
+def test_stored_runs_of_an_edited_case_are_refused(table, folder):
+    edited = CASES | {"greedy": {"model": POOLED, "policy": "greedy"}}
+    with pytest.raises(TrustboError, match="policy"):
+        run_grid(edited, SCENES, folder, seeds=(0, 1), n_missions=2)
+
+    priors = dataclasses.replace(POOLED.priors, beta0=dist.Beta(3.0, 2.0))
+    edited = CASES | {"random": CASES["random"] | {"model": tb.models.PooledTrust(priors)}}
+    with pytest.raises(TrustboError, match="model"):
+        run_grid(edited, SCENES, folder, seeds=(0, 1), n_missions=2)
+
+
+def test_stored_runs_of_an_edited_scene_are_refused(table, folder):
+    swapped = {"made 0": SCENES["made 1"], "made 1": SCENES["made 1"]}
+    with pytest.raises(TrustboError, match="workspace"):
+        run_grid(CASES, swapped, folder, seeds=(0, 1), n_missions=2, n_jobs=1)
+
+    moved = {name: lambda: scene(0)._replace(goal=(0, 1)) for name in SCENES}
+    with pytest.raises(TrustboError, match="goal"):
+        run_grid(CASES, moved, folder, seeds=(0, 1), n_missions=2, n_jobs=1)
+
+
+def test_a_scene_that_is_the_same_but_written_otherwise_is_recognised(table, folder):
+    def rewritten(seed):
+        made = scene(seed)
+        return made
+
+    scenes = {f"made {seed}": partial(rewritten, seed) for seed in (0, 1)}
+    again = run_grid(CASES, scenes, folder, seeds=(0, 1), n_missions=2, n_jobs=1)
+    pd.testing.assert_frame_equal(again, table)
+
+
+@pytest.mark.parametrize("which", ["object", "function"])
+def test_an_edited_policy_is_refused(tmp_path, which):
+    """Also if only a method that the policy calls was edited."""
+
+    def case(path_of):
+        class Own:
+            best = path_of
+
+            def __call__(self, rng, draws, planner):
+                return planner.evaluate(self.best(planner, draws), draws.mean())
+
+        options = {"model": POOLED, "policy": Own()}
+        return {"own": options if which == "object" else lambda scene: options}
+
+    scenes = {"made 0": SCENES["made 0"]}
+
+    def best(self, planner, draws):
+        return planner.plan(draws.mean()).path
+
+    def first(self, planner, draws):
+        return planner.plan(draws.flat().draw(0)).path
+
+    table = run_grid(case(best), scenes, tmp_path, n_missions=1, n_jobs=1)
+    again = run_grid(case(best), scenes, tmp_path, n_missions=1, n_jobs=1)
+    pd.testing.assert_frame_equal(again, table)
+    with pytest.raises(TrustboError, match="policy"):
+        run_grid(case(first), scenes, tmp_path, n_missions=1, n_jobs=1)
+
+
+def test_an_edited_simulator_is_refused(tmp_path):
+    """Also if the function of the scene, which uses the class, is the same."""
+
+    def scenes(noise):
+        class Noisy(Steady):
+            def run(self, path, *, seed, mission=0):
+                return noise(super().run(path, seed=seed))
+
+        def made():
+            where = scene(0)
+            return where._replace(simulator=Noisy(where.workspace))
+
+        return {"made 0": made}
+
+    def steady(mission):
+        return mission
+
+    def poor(mission):
+        return tb.Mission.from_arrays(mission.path, mission.awareness, 0.5 * mission.contact_rate)
+
+    case = {"random": CASES["random"]}
+    run_grid(case, scenes(steady), tmp_path, n_missions=1, n_jobs=1)
+    run_grid(case, scenes(steady), tmp_path, n_missions=1, n_jobs=1)
+    with pytest.raises(TrustboError, match="simulator"):
+        run_grid(case, scenes(poor), tmp_path, n_missions=1, n_jobs=1)
+
+
+def test_runs_without_a_record_or_of_another_version_are_refused(tmp_path, monkeypatch):
+    arguments = {"random": CASES["random"]}, {"made 0": SCENES["made 0"]}, tmp_path
+    run_grid(*arguments, n_missions=1, n_jobs=1)
+    monkeypatch.setitem(VERSIONS, "trustbo", "0.4.9")
+    with pytest.raises(TrustboError, match=r"0\.4\.9"):
+        run_grid(*arguments, n_missions=1, n_jobs=1)
+
+    (record,) = tmp_path.glob("*.json")
+    record.unlink()
+    with pytest.raises(TrustboError, match="record"):
+        run_grid(*arguments, n_missions=1, n_jobs=1)
+
+
+def test_names_that_are_one_file_in_two_calls_are_not_mixed(tmp_path):
+    scenes = {"made 0": SCENES["made 0"]}
+    run_grid({"tau=0.1": CASES["random"]}, scenes, tmp_path, n_missions=1, n_jobs=1)
+    with pytest.raises(TrustboError, match=r"tau=0\.1"):
+        run_grid({"tau 0.1": CASES["random"]}, scenes, tmp_path, n_missions=1, n_jobs=1)
 
 
 def test_a_run_that_fails_does_not_stop_the_others_and_is_run_again(tmp_path, table):
@@ -88,7 +197,7 @@ def test_a_run_that_fails_does_not_stop_the_others_and_is_run_again(tmp_path, ta
     options = {"seeds": (0, 1), "n_missions": 2, "n_jobs": 1}
     with pytest.raises(TrustboError, match="4 of 8 runs"):
         run_grid(CASES, scenes, tmp_path / "out", **options)
-    assert len(list((tmp_path / "out").iterdir())) == 4
+    assert len(list((tmp_path / "out").glob("*.csv"))) == 4
     switch.unlink()
     pd.testing.assert_frame_equal(run_grid(CASES, scenes, tmp_path / "out", **options), _timeless(
         table, run_grid(CASES, scenes, tmp_path / "out", **options)))  # fmt: skip

@@ -4,7 +4,7 @@ import copy
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +26,14 @@ from trustbo.errors import (
 from trustbo.files import FilePath, to_path, write_file
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
+from trustbo.study.record import (
+    describe_scene,
+    described,
+    read_record,
+    require_same,
+    source_of,
+    write_record,
+)
 from trustbo.workspace import Workspace
 
 _MAX_JOBS = 10**6
@@ -73,16 +81,23 @@ def run_grid(
 ) -> pd.DataFrame:
     """Run a campaign for each case, scene and seed, and evaluate the paths of all missions.
 
-    Each run writes a file whose name contains the case, scene, seed and number of missions. A run
-    is skipped if its file exists. Runs are parallelised with joblib; `joblib.parallel_config`
-    selects another backend, such as `backend="dask"` for a cluster. If the policy has a method
-    `learn(campaign, mission)`, it is called after each mission. If the policy has a method
-    `recommend(campaign)`, its path replaces the campaign's recommendation.
+    Each run writes a CSV file whose name contains the case, scene, seed and number of missions, and
+    a JSON file beside it that records the version of trustbo, the options of the case and the
+    content of the scene. A run is skipped if its files exist; if the record differs from the
+    present case or scene, `run_grid` raises an error. A scene, or a case that is a function, is
+    made and compared only if its function has changed: its code, functions and classes of the same
+    module that it uses, or values to which it refers. Changes in files and in other modules are
+    therefore not noticed; use another folder after such changes.
+
+    Runs are parallelised with joblib; `joblib.parallel_config` selects another backend, such as
+    `backend="dask"` for a cluster. If the policy has a method `learn(campaign, mission)`, it is
+    called after each mission. If the policy has a method `recommend(campaign)`, its path replaces
+    the campaign's recommendation.
 
     Args:
         cases: Cases, keyed by name.
         scenes: Functions, keyed by name, that make the scenes in the worker processes.
-        folder: Folder for the files of the runs, one CSV file per run.
+        folder: Folder for the files of the runs.
         seeds: Seeds of the campaigns.
         n_missions: Number of missions per campaign.
         n_jobs: Number of processes; -1 for one per core, 1 to use only this process.
@@ -98,7 +113,8 @@ def run_grid(
         learning, without the evaluation of the paths.
 
     Raises:
-        TrustboError: A run failed; call the function again to repeat failed runs.
+        TrustboError: A run failed (call the function again to repeat failed runs), or a stored run
+            had other options or another scene.
 
     Example:
         >>> cases = {"default": {}, "thompson": {"policy": "thompson"}}
@@ -117,66 +133,176 @@ def run_grid(
         raise TrustboError("run_grid needs at least one case, one scene and one seed.")
 
     root = to_path(folder)
-    runs = list(product(seeds, scenes, cases))
     files = {
-        (seed, scene, case): root / f"{_plain(case)}~{_plain(scene)}~{seed}~{n_missions}.csv"
-        for seed, scene, case in runs
+        _Run(case, scene, seed): root / f"{_plain(case)}~{_plain(scene)}~{seed}~{n_missions}.csv"
+        for seed, scene, case in product(seeds, scenes, cases)
     }
 
     # Some file systems ignore the case of letters.
-    if len({str(file).casefold() for file in files.values()}) < len(runs):
+    if len({str(file).casefold() for file in files.values()}) < len(files):
         raise TrustboError(
             "names of cases, and of scenes, must differ in more than punctuation and the case of "
             "letters; rename one."
         )
 
+    known = _known(cases, scenes, files)
+    _require_as_stored(cases, scenes, files, known, n_jobs)
     errors = Parallel(n_jobs=n_jobs)(
-        delayed(_run)(cases[case], scenes[scene], (case, scene, seed), n_missions, file)
-        for (seed, scene, case), file in files.items()
+        delayed(_run)(cases[run.case], scenes[run.scene], run, n_missions, file, known[run])
+        for run, file in files.items()
         if not file.exists()
     )
 
     failed = [error for error in errors if error]
     if failed:
         raise TrustboError(
-            f"{len(failed)} of {len(runs)} runs failed; call run_grid again to repeat them. The "
+            f"{len(failed)} of {len(files)} runs failed; call run_grid again to repeat them. The "
             f"first errors are: {'; '.join(failed[:_N_SHOWN])}"
         )
-    return pd.concat([_read(file, *run) for run, file in files.items()], ignore_index=True)
+    return pd.concat([_read(file, run) for run, file in files.items()], ignore_index=True)
+
+
+class _Run(NamedTuple):
+    """Name of a run."""
+
+    case: str
+    scene: str
+    seed: int
+
+
+class _Known(NamedTuple):
+    """What is known of a run before its scene is made."""
+
+    sources: dict[str, str | None]
+    """Hashes of the functions of the `case` and the `scene`."""
+    options: Any
+    """Description of the options of the case; None if the case is a function."""
+
+
+def _known(
+    cases: Mapping[str, Case], scenes: Mapping[str, Callable[[], Scene]], runs: Iterable[_Run]
+) -> dict[_Run, _Known]:
+    """Describe each run without making its scene; in this process, because hashes may differ."""
+    options = {name: None if callable(case) else described(case) for name, case in cases.items()}
+    of_cases = {name: source_of(case) for name, case in cases.items()}
+    of_scenes = {name: source_of(scene) for name, scene in scenes.items()}
+    return {
+        run: _Known({"case": of_cases[run.case], "scene": of_scenes[run.scene]}, options[run.case])
+        for run in runs
+    }
+
+
+def _require_as_stored(
+    cases: Mapping[str, Case],
+    scenes: Mapping[str, Callable[[], Scene]],
+    files: Mapping[_Run, Path],
+    known: Mapping[_Run, _Known],
+    n_jobs: int,
+) -> None:
+    """Raise TrustboError if a stored run had other options or another scene than now.
+
+    Scenes, and the options of cases that are functions, are made only if a function has changed.
+    """
+    records = {
+        run: read_record(file, run._asdict()) for run, file in files.items() if file.exists()
+    }
+
+    doubtful: dict[str, list[_Run]] = {}  # runs, keyed by the scene that must be made
+    for run, record in records.items():
+        if known[run].options is not None:
+            _require_same_case(run, record, known[run].options)
+        if record["sources"] != known[run].sources:
+            doubtful.setdefault(run.scene, []).append(run)
+
+    made: Any = Parallel(n_jobs=n_jobs)(
+        delayed(_contents)({run.case: cases[run.case] for run in runs}, scenes[scene], scene)
+        for scene, runs in doubtful.items()
+    )
+    for runs, contents in zip(doubtful.values(), made, strict=True):
+        for run in runs:
+            now = contents[run.case]
+            stored = records[run]["content"]["scene"]
+            require_same(f"scene {run.scene!r} had other contents", stored, now["scene"])
+            if known[run].options is None:
+                _require_same_case(run, records[run], now["case"])
+
+
+def _require_same_case(run: _Run, record: Mapping[str, Any], options: Mapping[str, Any]) -> None:
+    """Raise TrustboError unless a stored run had these options, as from `described`."""
+    what = f"case {run.case!r} was run with other options"
+    require_same(what, record["content"]["case"], options)
+
+
+def _contents(
+    cases: Mapping[str, Case], scene: Callable[[], Scene], name: str
+) -> dict[str, dict[str, Any]]:
+    """Make a scene, and describe it and the options of cases in it, keyed by case."""
+    try:
+        with warnings.catch_warnings(), threadpool_limits(1):
+            warnings.simplefilter("ignore")
+            where = scene()
+            return {case: _content(_options(cases[case], where), where) for case in cases}
+    except Exception as error:
+        raise TrustboError(
+            f"scene {name!r} cannot be made to compare it with its stored runs: "
+            f"{type(error).__name__}: {error}"
+        ) from error
+
+
+def _content(options: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
+    """Describe the options of a case and its scene for the record of a run."""
+    return {"case": described(options), "scene": describe_scene(scene)}
+
+
+def _options(case: Case, scene: Scene) -> Mapping[str, Any]:
+    """Return the options of a case in a scene."""
+    return case(scene) if callable(case) else case
 
 
 def _plain(name: str) -> str:
     return re.sub(r"\W+", "-", composed(name))
 
 
-def _read(file: Path, seed: int, scene: str, case: str) -> pd.DataFrame:
+def _read(file: Path, run: _Run) -> pd.DataFrame:
     """Read the rows of a run; texts such as "NA" are kept, and names may look like numbers."""
     table = pd.read_csv(file, keep_default_na=False, na_values=[""])
-    return table.assign(case=case, scene=scene, seed=seed)
+    return table.assign(**run._asdict())
 
 
 def _run(
-    case: Case, scene: Callable[[], Scene], names: tuple[str, str, int], n_missions: int, file: Path
+    case: Case,
+    scene: Callable[[], Scene],
+    run: _Run,
+    n_missions: int,
+    file: Path,
+    known: _Known,
 ) -> str:
-    """Run a campaign and write its rows to a file; return the error message, or ""."""
-    labels = dict(zip(("case", "scene", "seed"), names, strict=True))
+    """Run a campaign and write its rows and its record; return the error message, or ""."""
     try:
         with warnings.catch_warnings(), threadpool_limits(1):
             warnings.simplefilter("ignore")
             where = scene()
+            options = _options(case, where)
+            content = _content(options, where)  # before the campaign changes a policy
+            if known.options is not None:
+                content["case"] = known.options
             rows = [
-                labels | dict(where.labels) | row
-                for row in _rows(case, where, names[2], n_missions)
+                run._asdict() | dict(where.labels) | row
+                for row in _rows(options, where, run.seed, n_missions)
             ]
+
+        # The table is last, because a run counts as stored if its table exists.
+        write_record(file, run._asdict(), known.sources, content)
         write_file(file, lambda path: pd.DataFrame(rows).to_csv(path, index=False))
     except Exception as error:  # an error in one run does not stop the others
-        return f"{', '.join(map(str, names))}: {type(error).__name__}: {error}"
+        return f"{', '.join(map(str, run))}: {type(error).__name__}: {error}"
     return ""
 
 
-def _rows(case: Case, scene: Scene, seed: int, n_missions: int) -> Iterator[dict[str, Any]]:
+def _rows(
+    options: Mapping[str, Any], scene: Scene, seed: int, n_missions: int
+) -> Iterator[dict[str, Any]]:
     """Run a campaign and yield its rows; the first is from before the first mission."""
-    options = case(scene) if callable(case) else case
     given = {
         "workspace": scene.workspace,
         "start": scene.start,

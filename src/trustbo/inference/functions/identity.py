@@ -99,8 +99,8 @@ def _values_of(function: Any) -> dict[str, Any]:
     values = {one.name: one.default for one in parameters if one.default is not one.empty}
     code = function.__code__
     cells = function.__closure__ or ()
-    values |= {n: _content(cell) for n, cell in zip(code.co_freevars, cells, strict=True)}
-    names = sorted(_names_in(code) & set(function.__globals__))
+    values |= {n: content_of(cell) for n, cell in zip(code.co_freevars, cells, strict=True)}
+    names = sorted(names_in(code) & set(function.__globals__))
     values |= {name: function.__globals__[name] for name in names if _is_own(function, name)}
     return values
 
@@ -155,16 +155,16 @@ def _describe_function(
     parts.append(_code_of(function))
     defaults = function.__defaults__ or ()
     by_keyword = function.__kwdefaults__ or {}
-    enclosed = [_content(cell) for cell in function.__closure__ or ()]
+    enclosed = [content_of(cell) for cell in function.__closure__ or ()]
     for one in (*defaults, *by_keyword.values(), *enclosed):
         _describe(one, parts, seen)
-    for name in sorted(_names_in(function.__code__)):
+    for name in sorted(names_in(function.__code__)):
         _describe_global(function, name, parts, seen)
 
 
-def _names_in(code: CodeType) -> set[str]:
+def names_in(code: CodeType) -> set[str]:
     """Return the names of globals and attributes in a code, including its inner functions."""
-    inner = [_names_in(one) for one in code.co_consts if isinstance(one, CodeType)]
+    inner = [names_in(one) for one in code.co_consts if isinstance(one, CodeType)]
     return {*code.co_names}.union(*inner)
 
 
@@ -328,7 +328,7 @@ def _constant(value: Any) -> str:
     return repr(value)
 
 
-def _content(cell: Any) -> Any:
+def content_of(cell: Any) -> Any:
     """Return the value of a variable of an enclosing function, or None if it is not set."""
     try:
         return cell.cell_contents
