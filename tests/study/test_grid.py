@@ -286,6 +286,29 @@ def test_names_that_are_one_file_are_refused(tmp_path):
         run_grid({"a": {}, "A": {}}, SCENES, tmp_path)
 
 
+OWN = {"seed": 7, "directory": "here", "overwrite": True, "start": (0, 0)}
+"""Arguments of `Campaign` that `run_grid` sets."""
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_cases_cannot_set_what_the_grid_sets(tmp_path, name):
+    own = {name: OWN[name]}
+    with pytest.raises(TrustboError, match=name):
+        run_grid({"own": own}, SCENES, tmp_path / "out", n_jobs=1)
+    with pytest.raises(TrustboError, match=name):
+        run_grid({"own": lambda scene: own}, SCENES, tmp_path / "out", n_jobs=1)
+
+    scenes = {"made 0": lambda: scene(0)._replace(options=own)}
+    with pytest.raises(TrustboError, match=name):
+        run_grid({"own": {}}, scenes, tmp_path / "out", n_jobs=1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_repeated_seeds_are_refused(tmp_path):
+    with pytest.raises(TrustboError, match="seeds"):
+        run_grid(CASES, SCENES, tmp_path, seeds=[0, 0])
+
+
 @pytest.mark.slow  # processes that import JAX
 def test_processes_give_the_same_table(table, tmp_path):
     found = run_grid(CASES, SCENES, tmp_path, seeds=(0, 1), n_missions=2, n_jobs=2)

@@ -40,6 +40,8 @@ _MAX_JOBS = 10**6
 """Largest number of processes that joblib may leave free (a negative `n_jobs`)."""
 _N_SHOWN = 3
 """Number of runs whose errors the message contains."""
+_SET = ("workspace", "start", "goal", "directory", "overwrite")
+"""Arguments of `Campaign`, besides the seed, that cases and scenes cannot set."""
 
 
 class Scene(NamedTuple):
@@ -98,7 +100,7 @@ def run_grid(
         cases: Cases, keyed by name.
         scenes: Functions, keyed by name, that make the scenes in the worker processes.
         folder: Folder for the files of the runs.
-        seeds: Seeds of the campaigns.
+        seeds: Seeds of the campaigns, without repeats.
         n_missions: Number of missions per campaign.
         n_jobs: Number of processes; -1 for one per core, 1 to use only this process.
 
@@ -113,8 +115,9 @@ def run_grid(
         learning, without the evaluation of the paths.
 
     Raises:
-        TrustboError: A run failed (call the function again to repeat failed runs), or a stored run
-            had other options or another scene.
+        TrustboError: A run failed (call the function again to repeat failed runs), a stored run had
+            other options or another scene, or a case or scene sets an argument of `Campaign` that
+            `run_grid` sets, such as the seed.
 
     Example:
         >>> cases = {"default": {}, "thompson": {"policy": "thompson"}}
@@ -131,6 +134,12 @@ def run_grid(
         raise TrustboError("n_jobs must be a number of processes, or -1; got 0.")
     if not (cases and scenes and seeds):
         raise TrustboError("run_grid needs at least one case, one scene and one seed.")
+
+    if len(set(seeds)) < len(seeds):
+        raise TrustboError(f"seeds must differ from each other; got {seeds}.")
+    for name, case in cases.items():
+        if not callable(case):
+            _require_free(f"case {name!r}", case)
 
     root = to_path(folder)
     files = {
@@ -192,6 +201,21 @@ def _known(
     }
 
 
+def _require_free(what: str, options: Any) -> None:
+    """Raise TrustboError unless options are a dict without the arguments that `run_grid` sets."""
+    require_kind(what, options, Mapping, "give a dict of options of Campaign")
+    if "seed" in options:
+        raise TrustboError(
+            f"{what} has the seed {options['seed']!r}, so all its runs would be the same; seeds "
+            "belong in seeds=."
+        )
+    for option in _SET:
+        if option in options:
+            raise TrustboError(
+                f"{what} has the option {option!r}, which run_grid sets for each run; leave it out."
+            )
+
+
 def _require_as_stored(
     cases: Mapping[str, Case],
     scenes: Mapping[str, Callable[[], Scene]],
@@ -241,7 +265,7 @@ def _contents(
         with warnings.catch_warnings(), threadpool_limits(1):
             warnings.simplefilter("ignore")
             where = scene()
-            return {case: _content(_options(cases[case], where), where) for case in cases}
+            return {case: _content(_options(case, cases[case], where), where) for case in cases}
     except Exception as error:
         raise TrustboError(
             f"scene {name!r} cannot be made to compare it with its stored runs: "
@@ -254,9 +278,15 @@ def _content(options: Mapping[str, Any], scene: Scene) -> dict[str, Any]:
     return {"case": described(options), "scene": describe_scene(scene)}
 
 
-def _options(case: Case, scene: Scene) -> Mapping[str, Any]:
+def _options(name: str, case: Case, scene: Scene) -> Mapping[str, Any]:
     """Return the options of a case in a scene."""
-    return case(scene) if callable(case) else case
+    _require_free("the scene", scene.options)
+    if not callable(case):
+        return case
+
+    options = case(scene)
+    _require_free(f"case {name!r}", options)
+    return options
 
 
 def _plain(name: str) -> str:
@@ -282,7 +312,7 @@ def _run(
         with warnings.catch_warnings(), threadpool_limits(1):
             warnings.simplefilter("ignore")
             where = scene()
-            options = _options(case, where)
+            options = _options(run.case, case, where)
             content = _content(options, where)  # before the campaign changes a policy
             if known.options is not None:
                 content["case"] = known.options
