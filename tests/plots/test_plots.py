@@ -11,6 +11,7 @@ import pytest
 
 import trustbo as tb
 from trustbo import plots
+from trustbo.plots.explorer import _layers
 from trustbo.plots.maps import contour_interval, contours, draw_path, extent_of, trust_limits
 from trustbo.report import facts_of, write_report
 
@@ -89,6 +90,45 @@ def test_a_map_shows_the_values_of_passable_cells_in_metres(result):
     shown = np.ma.filled(ax.images[0].get_array(), np.nan)
     np.testing.assert_array_equal(shown, np.where(known, result.trust_map.values, np.nan))
     assert tuple(ax.images[0].get_extent()) == extent_of(result.workspace.grid) == (0, 60, 0, 80)
+
+
+def other_order(values):
+    """The same map, with rows from south to north, columns from east to west, and x first."""
+    south = values.sortby(values.dims[0], ascending=values.dims[0] == "y")
+    return south.sortby(values.dims[1], ascending=False).transpose(*values.dims[::-1])
+
+
+def test_maps_are_aligned_by_their_coordinates(result):
+    """Also the start, whose trust is assumed."""
+    workspace = result.workspace
+    placed = result.maps(n_draws=10)["trust_mean"]
+    by_cell = result.trust_map.assign_coords(row=range(4), col=range(3))
+    for values in (placed, by_cell):
+        expected = plots.cell_map(values, workspace).images[0].get_array()
+        assert np.ma.getmaskarray(expected)[3, 0]
+        shown = plots.cell_map(other_order(values), workspace).images[0].get_array()
+        np.testing.assert_array_equal(np.ma.filled(shown, -1.0), np.ma.filled(expected, -1.0))
+
+
+def test_maps_of_other_cells_are_refused(result):
+    placed = result.maps(n_draws=10)["trust_mean"]
+    step = result.workspace.grid.cell_height
+    for values, match in (
+        (placed.assign_coords(y=placed["y"] + 0.5 * step), "y coordinates"),
+        (placed.assign_coords(x=["a", "b", "c"]), "x coordinates"),
+        (placed.isel(y=slice(3)), "shape"),
+        (placed.rename(y="north"), "dims"),
+        (result.robot_maps()["trust_mean"], r"\.sel\(robot='r1'\)"),
+    ):
+        with pytest.raises(tb.TrustboError, match=match):
+            plots.cell_map(values, result.workspace)
+
+
+def test_layers_of_the_explorer_are_aligned_by_their_coordinates(result):
+    maps = result.maps(n_draws=10)
+    expected = _layers(result.plan, maps, result.history)
+    layers = _layers(result.plan, maps.sortby("y"), result.history)
+    np.testing.assert_array_equal(layers["trust mean"], expected["trust mean"])
 
 
 def test_a_path_goes_through_the_centres_of_its_cells(result):

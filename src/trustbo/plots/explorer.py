@@ -27,7 +27,7 @@ from trustbo.plots.maps import (
     trust_limits,
 )
 from trustbo.plots.style import ROBOTS
-from trustbo.workspace.grid import Grid, over_cells
+from trustbo.workspace.grid import Grid
 
 _PLANNED_ON = "trust map used to plan the mission"
 _MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "plus")
@@ -233,8 +233,9 @@ def _plot_cells(plan: Plan, names: Sequence[str], cells: Any, colours: Any) -> A
 def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.ndarray]:
     """Return maps (row, col), keyed by name; "mission 1" is the trust map of the first mission."""
     free = plan.workspace.passable.values
+    grid = plan.workspace.grid
     layers = {
-        str(name).replace("_", " "): over_cells(values).transpose("row", "col").values
+        str(name).replace("_", " "): grid.over_cells(str(name), values).values
         for name, values in maps.data_vars.items()
         if values.ndim == 2
     }

@@ -32,7 +32,7 @@ from trustbo.plots.style import (
 )
 from trustbo.terrain import pixel_size
 from trustbo.workspace import Workspace
-from trustbo.workspace.grid import Grid, over_cells
+from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import require_on_grid
 
 MOMENTS = (1, 2, 4)
@@ -116,11 +116,12 @@ def trust_maps(
     n_missions = history.sizes["iteration"]
     chosen = [i for i in missions if 1 <= i <= n_missions]
     maps = [history["trust_map"].sel(iteration=i) for i in chosen] + [trust_map]
+    maps = [workspace.grid.over_cells("trust_map", trust) for trust in maps]
     steps = [history["path"].sel(iteration=i).values for i in chosen] + [np.array(path)]
     paths = [cells_of(cells) for cells in steps]
     learned = [i - 1 for i in chosen] + [n_missions]
 
-    values = np.stack([trust.transpose("row", "col").values for trust in maps])
+    values = np.stack([trust.values for trust in maps])
     values[:, *path[0]] = np.nan
     low, high = trust_limits(values[[n > 0 for n in learned]])
     norm = Normalize(low, high)
@@ -229,7 +230,8 @@ def cell_map(
     the attribute `start` of `Result.maps`) because its trust is assumed.
 
     Args:
-        values: Map with the dims (row, col), or (y, x) as in `Result.maps`.
+        values: Map with the dims (row, col), or (y, x) as in `Result.maps`, which is aligned with
+            the cells by its coordinates if it has any.
         workspace: Workspace of the cells.
         path: Path to draw.
         limits: Values at the ends of the colour scale; by default the range of the map, up to 1 if
@@ -241,6 +243,10 @@ def cell_map(
 
     Returns:
         Axes of the map; the image of the map is `images[0]` of these axes.
+
+    Raises:
+        TrustboError: The map has other axes, such as `robot`, another shape or coordinates of other
+            cells, or the path is not on the grid.
 
     Example:
         >>> tb.plots.cell_map(result.maps()["trust_sd"], workspace, path=result.path)
@@ -393,8 +399,8 @@ def draw_cells(
 
 def shown_values(values: xr.DataArray, workspace: Workspace) -> np.ndarray:
     """Return a map (row, col) with NaN in impassable cells and where trust is assumed."""
-    shown = over_cells(values).transpose("row", "col").values
-    shown = np.where(workspace.passable.values, shown, np.nan)
+    of_cells = workspace.grid.over_cells("values", values).values
+    shown = np.where(workspace.passable.values, of_cells, np.nan)
     if "start" in values.attrs:
         row, col = values.attrs["start"].split(",")
         shown[int(row), int(col)] = np.nan

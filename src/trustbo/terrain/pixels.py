@@ -13,6 +13,9 @@ from numba.extending import register_jitable
 
 from trustbo.errors import require_kind
 
+_TOLERANCE = 0.01
+"""Largest distance of a coordinate from the centre of its pixel, as a fraction of the pixel."""
+
 
 def pixel_size(terrain: xr.Dataset) -> tuple[float, float]:
     """Return pixel height and width in metres.
@@ -50,3 +53,25 @@ def nearest_pixel(x: Any, y: Any, origin: Any, pixel: Any, shape: Any) -> Any:
 def index_within(x: Any, n: Any) -> Any:
     """Round down to indices from 0 to n - 1; NaN becomes 0, so that kernels stay in the raster."""
     return np.int64(np.fmin(np.fmax(np.floor(x), 0.0), n - 1.0))
+
+
+def order_along(centres: np.ndarray, coordinates: np.ndarray, step: float) -> np.ndarray | None:
+    """Return which of the coordinates is at each centre; None if they are not those of the centres.
+
+    Args:
+        centres: Centres of the pixels along an axis, shape (pixel,), in any order.
+        coordinates: Coordinates of the user's values, in any order.
+        step: Size of a pixel.
+    """
+    if coordinates.shape != centres.shape or coordinates.dtype.kind not in "iuf":
+        return None
+
+    of_centres = np.argsort(centres)
+    of_coordinates = np.argsort(coordinates)
+    away = np.abs(coordinates[of_coordinates] - centres[of_centres])
+    if not (away <= _TOLERANCE * step).all():  # also NaN
+        return None
+
+    order = np.empty(len(centres), dtype=int)
+    order[of_centres] = of_coordinates
+    return order

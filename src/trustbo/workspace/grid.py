@@ -15,8 +15,8 @@ from rasterio.transform import from_origin
 
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_pair
-from trustbo.terrain.pixels import index_within, row_and_col
+from trustbo.errors import TrustboError, one_line, require_pair
+from trustbo.terrain.pixels import index_within, order_along, row_and_col
 from trustbo.terrain.place import converted, quiet_affine
 
 type Location = Cell | Mapping[str, float]
@@ -227,6 +227,58 @@ class Grid(Summary):
         step = self.cell_width, self.cell_height
         return placed.rio.write_transform(from_origin(self.left, self.top, *step))
 
+    def over_cells(self, what: str, values: xr.DataArray) -> xr.DataArray:
+        """Return a map of the cells with the dims (row, col), in the order of the grid.
+
+        Args:
+            what: Name of the map in error messages.
+            values: Map with the dims (row, col), or (y, x) as in `Result.maps`, in any order. Axes
+                with coordinates are aligned by them, and other axes by position.
+
+        Raises:
+            TrustboError: The map has other dims or another shape, or its coordinates are not those
+                of the cells.
+        """
+        dims = ("y", "x") if {"y", "x"} <= set(values.dims) else ("row", "col")
+        others = [str(dim) for dim in values.dims if dim not in dims]
+        if not set(dims) <= set(values.dims):
+            raise TrustboError(
+                f"{what} must have the dims (row, col) or (y, x); got {tuple(values.dims)}."
+            )
+        if others:
+            raise TrustboError(
+                f"{what} has one map for each {others[0]}; select one, e.g. with "
+                f"{_selection(values, others[0])}."
+            )
+
+        values = values.transpose(*dims)
+        if values.shape != self.shape:
+            raise TrustboError(
+                f"{what} must have the shape of the grid, {self.shape}; got {values.shape}."
+            )
+
+        rows, cols = (np.arange(n) for n in self.shape)
+        centres = {
+            "row": (dims[0], rows, 1.0),
+            "col": (dims[1], cols, 1.0),
+            "y": (dims[0], self.y, self.cell_height),
+            "x": (dims[1], self.x, self.cell_width),
+        }
+        for name, (dim, expected, step) in centres.items():
+            if name not in values.coords or values[name].dims != (dim,):
+                continue
+            order = order_along(expected, values[name].values, step)
+            if order is None:
+                raise TrustboError(
+                    f"{what} has the {name} coordinates {one_line(values[name].values.tolist())}, "
+                    f"but the cells have {one_line(expected.tolist())}; give a map of these cells, "
+                    "or values without coordinates."
+                )
+            values = values.isel({dim: order})
+
+        unlabelled = values.drop_vars(["y", "x", "row", "col"], errors="ignore")
+        return unlabelled.rename(dict(zip(dims, ("row", "col"), strict=True)))
+
     def cell_means(self, values: xr.DataArray) -> np.ndarray:
         """Average the finite pixel values of each cell.
 
@@ -263,8 +315,8 @@ class Grid(Summary):
         return CRS.from_user_input(self.crs)
 
 
-def over_cells[Map: (xr.Dataset, xr.DataArray)](maps: Map) -> Map:
-    """Rename the dimensions (y, x) of maps, such as those of `Result.maps()`, to (row, col)."""
-    if not {"y", "x"} <= set(maps.dims):
-        return maps
-    return maps.drop_vars(["y", "x"], errors="ignore").rename(y="row", x="col")
+def _selection(values: xr.DataArray, dim: str) -> str:
+    """Return the code that selects the first entry of an axis, such as `.sel(robot='r1')`."""
+    if dim in values.coords and values.sizes[dim]:
+        return f".sel({dim}={values[dim].values.tolist()[0]!r})"
+    return f".isel({dim}=0)"
