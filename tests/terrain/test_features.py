@@ -15,6 +15,7 @@ from trustbo.terrain.features import (
     canopy_cover,
     canopy_height,
     openness,
+    pixel_feature,
     roughness,
     slope,
     step_height,
@@ -198,6 +199,49 @@ def test_a_feature_of_one_s_own():
         feature("other", sign=0)
     with pytest.raises(TrustboError, match="name"):
         feature(None, sign=1)
+
+
+def of_function(function, terrain):
+    """Compute a feature that is registered only for this call."""
+    feature("own", sign=1)(function)
+    try:
+        return pixel_feature("own", terrain)
+    finally:
+        del FEATURES["own"]
+
+
+@pytest.mark.parametrize(
+    "other_order",
+    [
+        lambda values: values.sortby("y"),
+        lambda values: values.transpose("x", "y").sortby("x", ascending=False),
+        lambda values: values.drop_vars(["y", "x"]).transpose("x", "y"),
+        lambda values: values.values,
+    ],
+)
+def test_features_are_aligned_with_the_terrain_by_their_labels(other_order):
+    terrain = rough_terrain()
+    found = of_function(lambda given: other_order(given["dem"]), terrain)
+    np.testing.assert_array_equal(found, terrain["dem"].values)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda dem: dem.assign_coords(y=dem["y"] + 0.5),
+        lambda dem: dem.assign_coords(x=[f"column {i}" for i in range(24)]),
+        lambda dem: dem.isel(y=slice(3)),
+        lambda dem: dem.rename(y="row", x="col"),
+        lambda dem: dem.expand_dims("band"),
+        lambda dem: dem.values[:3],
+        lambda dem: 0.5,
+        lambda dem: None,
+        lambda dem: np.full(dem.shape, "high"),
+    ],
+)
+def test_features_that_are_no_numbers_of_the_pixels_are_refused(wrong):
+    with pytest.raises(TrustboError, match="'own'"):
+        of_function(lambda terrain: wrong(terrain["dem"]), rough_terrain())
 
 
 def test_a_definition_of_a_feature_may_run_again():

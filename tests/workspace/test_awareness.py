@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from trustbo.errors import TrustboError
-from trustbo.terrain import synthetic_terrain
+from trustbo.terrain import FEATURES, feature, synthetic_terrain
 from trustbo.terrain.features import canopy_cover
 from trustbo.workspace import Sight, Workspace
 from trustbo.workspace.netcdf import workspace_from_tree, workspace_to_tree
@@ -101,3 +101,14 @@ def test_pixel_maps_are_those_of_the_terrain(terrain):
     missing = workspace.pixels["visibility"].isnull()
     assert missing.values[terrain["dem"].isnull().values].all()
     assert missing.sum() < 60  # squares of 4 x 4 pixels share an openness
+
+
+def test_a_feature_that_returns_a_sorted_map_is_not_mirrored():
+    terrain = synthetic_terrain((60.0, 60.0), seed=0)
+    north = (terrain["y"] > float(terrain["y"].mean())) * xr.ones_like(terrain["dem"])
+    feature("north", sign=1)(lambda given: north.sortby("y"))
+    try:
+        workspace = Workspace.from_terrain(terrain, (2, 2), bounds=False, features={"n": "north"})
+    finally:
+        del FEATURES["north"]
+    np.testing.assert_allclose(workspace.awareness[0].max("move")[..., 0], [[1, 1], [0, 0]])

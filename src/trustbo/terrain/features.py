@@ -1,8 +1,8 @@
 """Features of pixels that impede motion or sight.
 
 A feature is a function of a terrain (Dataset of `dem` and `dsm`, dims (y, x), metres) that returns
-an array (row, col), NaN where unknown. `feature` registers such a function for composites, as in
-the example in `docs/terrain.md`.
+an array (row, col), or a DataArray (y, x), NaN where unknown. `feature` registers such a function
+for composites, as in the example in `docs/terrain.md`.
 """
 
 from collections.abc import Callable
@@ -12,10 +12,18 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from trustbo.errors import TrustboError, one_line, require_kind, require_tuple, require_whole
+from trustbo.arrays import as_array
+from trustbo.errors import (
+    TrustboError,
+    one_line,
+    require_choice,
+    require_kind,
+    require_tuple,
+    require_whole,
+)
 from trustbo.parallel import over_rows
 from trustbo.terrain import rays
-from trustbo.terrain.pixels import pixel_size
+from trustbo.terrain.pixels import order_along, pixel_size
 
 TRAVERSABILITY = ("slope", "roughness", "tri", "step_height")
 """Pixel features of traversability (z1); each lowers it."""
@@ -42,6 +50,9 @@ FEATURES: dict[str, Feature] = {}
 def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[F], F]:
     """Register a function as a feature of pixels under a new name (decorator).
 
+    The function returns one number for each pixel: an array (row, col) with the northernmost row
+    first, or a DataArray (y, x), which is aligned with the terrain by its coordinates.
+
     A function replaces an earlier one with the same name from the same module, so that a cell of a
     notebook can be run again.
 
@@ -66,6 +77,58 @@ def feature[F: Callable[..., np.ndarray]](name: str, *, sign: int) -> Callable[[
         return compute
 
     return register
+
+
+def pixel_feature(name: str, terrain: xr.Dataset, **options: float) -> np.ndarray:
+    """Compute a feature of a terrain's pixels, shape (row, col).
+
+    A DataArray that the feature returns is aligned with the terrain by its coordinates, or by
+    position along axes without coordinates.
+
+    Raises:
+        TrustboError: The feature is unknown, or it did not return a number for each pixel.
+    """
+    compute = FEATURES[require_choice("feature", name, FEATURES)].compute
+    values: Any = compute(terrain, **options)
+    what = f"the result of feature {name!r}"
+
+    dem = terrain["dem"]
+    if isinstance(values, xr.DataArray):
+        values = _in_order_of(terrain, what, values)
+
+    if np.shape(values) != dem.shape:
+        raise TrustboError(
+            f"{what} must have the shape of the terrain, {dem.shape}; got {_kind_of(values)}."
+        )
+    return as_array(what, values)
+
+
+def _in_order_of(terrain: xr.Dataset, what: str, values: xr.DataArray) -> np.ndarray:
+    """Return values of pixels in the order of the terrain; raises TrustboError for other pixels."""
+    dem = terrain["dem"]
+    if set(values.dims) != set(dem.dims):
+        raise TrustboError(
+            f"{what} must have the dims {dem.dims}; got {values.dims}; return an array without "
+            "labels if its axes are rows and columns of pixels."
+        )
+
+    for dim, step in zip(dem.dims, pixel_size(terrain), strict=True):
+        if dim not in values.coords:
+            continue
+        order = order_along(dem[dim].values, values[dim].values, step)
+        if order is None:
+            raise TrustboError(
+                f"{what} has other {dim} coordinates than the terrain, such as "
+                f"{one_line(values[dim].values[:1].tolist())}; return one value for each pixel, "
+                "e.g. with .reindex_like(terrain)."
+            )
+        values = values.isel({dim: order})
+    return values.transpose(*dem.dims).values
+
+
+def _kind_of(values: Any) -> str:
+    """Describe a wrong result of a feature: its shape or, without axes, its value."""
+    return f"shape {np.shape(values)}" if np.ndim(values) else one_line(values)
 
 
 def _origin(function: Callable[..., Any]) -> tuple[object, ...]:

@@ -13,9 +13,10 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled, without_rounding
 from trustbo.data import is_line_of_sight
-from trustbo.errors import TrustboError, require_choice, require_kind
+from trustbo.errors import TrustboError, require_kind
 from trustbo.team import Team
 from trustbo.terrain import FEATURES, CompositeIndex
+from trustbo.terrain.features import pixel_feature
 from trustbo.workspace.grid import MAX_MISSING, Grid
 from trustbo.workspace.line_of_sight import bound_maps
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, existing_bounds
@@ -43,8 +44,9 @@ def pixel_maps(
         A dataset (y, x) of each feature, in [0, 1], and the fitted composite indices.
 
     Raises:
-        TrustboError: A feature is unknown, has a name that is reserved or that files cannot store,
-            or is used unchanged but has values outside [0, 1].
+        TrustboError: A feature is unknown, does not return a number for each pixel, has a name that
+            is reserved or that files cannot store, or is used unchanged but has values outside
+            [0, 1].
     """
     remedy = "map each feature to its pixel features, such as {'ease': ('slope', 'tri')}"
     if not require_kind("features", features, Mapping, remedy):
@@ -61,8 +63,7 @@ def pixel_maps(
             )
 
     def values_of(name: str) -> np.ndarray:
-        compute = FEATURES[require_choice("feature", name, FEATURES)].compute
-        return compute(terrain, **options.get(name, {}))
+        return pixel_feature(name, terrain, **options.get(name, {}))
 
     pixels = {}
     composites = {}
