@@ -83,6 +83,20 @@ def test_too_few_axes_are_refused(result):
         result.plot_maps(ax=plt.gca())
 
 
+@pytest.mark.parametrize("missions", [[5], [1, 5], [0], 1])
+def test_maps_of_missions_that_were_not_run_are_refused(result, missions):
+    with pytest.raises(tb.TrustboError, match="mission"):
+        result.plot_maps(missions=missions)
+    assert not plt.get_fignums()
+
+
+def test_effects_of_a_model_without_robot_effects_are_refused():
+    with pytest.raises(tb.TrustboError, match="RobotEffect"):
+        plots.robot_effects(pd.DataFrame())
+    with pytest.raises(tb.TrustboError, match="table"):
+        plots.robot_effects(None)
+
+
 def test_a_map_shows_the_values_of_passable_cells_in_metres(result):
     ax = plots.cell_map(result.trust_map, result.workspace, limits=(0.0, 1.0))
     known = result.workspace.passable.values.copy()

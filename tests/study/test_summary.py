@@ -98,6 +98,14 @@ def test_a_table_of_scenes_without_truth_is_refused():
         numbers_of(table)
 
 
+def test_a_table_of_missions_is_not_one_of_runs():
+    table = table_by_hand()
+    with pytest.raises(TrustboError, match="numbers_of"):
+        summary(table)
+    with pytest.raises(TrustboError, match="numbers_of"):
+        differences(table, "ours")
+
+
 def test_unknown_cases_and_columns_are_refused():
     numbers = numbers_of(table_by_hand())
     with pytest.raises(TrustboError):

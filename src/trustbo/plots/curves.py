@@ -9,7 +9,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from trustbo.errors import TrustboError, require_choice, require_whole
+from trustbo.errors import TrustboError, require_choice, require_kind, require_whole
 from trustbo.inference.draws import require_posterior
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.plots.style import (
@@ -199,11 +199,17 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
         Axes with the effects.
 
     Raises:
-        TrustboError: A column is missing.
+        TrustboError: The model has no robot effects, or a column is missing.
 
     Example:
         >>> tb.plots.robot_effects(tb.check(result).robots)
     """
+    require_kind("table", table, pd.DataFrame, "give tb.check(result).robots")
+    if table.empty:
+        raise TrustboError(
+            "the table is empty, because the model has no robot effects; use a model with "
+            "models.RobotEffect(), such as the default model."
+        )
     for name in ("mission", "robot", "effect", "sd", "stands_out"):
         require_choice("column", name, [str(column) for column in table.columns])
 

@@ -78,7 +78,7 @@ def trust_maps(
     path: Sequence[Cell],
     workspace: Workspace,
     *,
-    missions: Sequence[int] = MOMENTS,
+    missions: Sequence[int] | None = None,
     driven: np.ndarray | None = None,
     ax: Any = None,
 ) -> np.ndarray:
@@ -94,13 +94,16 @@ def trust_maps(
         trust_map: Map after the last mission, dims (row, col), such as `Result.trust_map`.
         path: Path recommended after the last mission, such as `Result.path`.
         workspace: Workspace of the cells.
-        missions: Numbers of missions, from 1; missions that were not run are skipped.
+        missions: Numbers of missions, from 1; by default those of 1, 2 and 4 that were run.
         driven: Whether each cell had been entered before each mission and after the last one, shape
             (mission + 1, row, col). Other cells are hatched, because their trust is only predicted.
         ax: Axes to draw on, one for each panel; by default a new figure with a legend.
 
     Returns:
         Axes, shape (panel,).
+
+    Raises:
+        TrustboError: A mission was not run, or `ax` has too few axes.
 
     Example:
         >>> maps = result.history, result.trust_map, result.path
@@ -111,10 +114,17 @@ def trust_maps(
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
 
     path = require_path_of_cells(path, workspace)
-    missions = [require_whole("mission", i, 1) for i in require_list("missions", missions)]
-
     n_missions = history.sizes["iteration"]
-    chosen = [i for i in missions if 1 <= i <= n_missions]
+    if missions is None:
+        chosen = [i for i in MOMENTS if i <= n_missions]
+    else:
+        given = require_list("missions", missions, remedy="give numbers of missions, such as [1]")
+        chosen = [require_whole("mission", i, 1) for i in given]
+    if chosen and max(chosen) > n_missions:
+        raise TrustboError(
+            f"missions has {max(chosen)}, but the last mission is {n_missions}; leave it out."
+        )
+
     maps = [history["trust_map"].sel(iteration=i) for i in chosen] + [trust_map]
     maps = [workspace.grid.over_cells("trust_map", trust) for trust in maps]
     steps = [history["path"].sel(iteration=i).values for i in chosen] + [np.array(path)]

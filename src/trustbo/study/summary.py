@@ -27,6 +27,8 @@ _JUDGED = {
 """Columns of `run_grid` that describe a mission; the others are labels of the run."""
 _RUN = ["case", "scene", "seed"]
 """Columns that identify a run."""
+_FIRST = "regret after 0"
+"""First column of `numbers_of` that is a quantity."""
 _N_RESAMPLES = 1000
 """Number of bootstrap resamples."""
 _ENDS = (0.025, 0.975)
@@ -104,13 +106,13 @@ def summary(numbers: pd.DataFrame, by: str | Sequence[str] = "case") -> pd.DataF
         the interval are NaN if there is only one scene.
 
     Raises:
-        TrustboError: A column is unknown.
+        TrustboError: The table is not from `numbers_of`, or a column is unknown.
 
     Example:
         >>> numbers = tb.study.numbers_of(table)  # of `run_grid`
         >>> tb.study.summary(numbers)["lost while learning"]
     """
-    require_kind("numbers", numbers, pd.DataFrame, "give the rows of numbers_of")
+    _require_numbers(numbers)
     by = _columns(by, numbers)
     if not by:
         raise TrustboError("by must name at least one column; got none.")
@@ -136,13 +138,14 @@ def differences(numbers: pd.DataFrame, ours: str, by: str | Sequence[str] = ()) 
         if there is only one scene.
 
     Raises:
-        TrustboError: A case or column is unknown, or no other case has a scene and seed in common.
+        TrustboError: The table is not from `numbers_of`, a case or column is unknown, or no other
+            case has a scene and seed in common.
 
     Example:
         >>> numbers = tb.study.numbers_of(table)  # of `run_grid`
         >>> tb.study.differences(numbers, ours="default")["lost while learning"]
     """
-    require_kind("numbers", numbers, pd.DataFrame, "give the rows of numbers_of")
+    _require_numbers(numbers)
     require_choice("case", ours, dict.fromkeys(numbers["case"]))
     by = _columns(by, numbers)
 
@@ -163,6 +166,16 @@ def differences(numbers: pd.DataFrame, ours: str, by: str | Sequence[str] = ()) 
         label = key if by else key[0]  # pyright: ignore[reportIndexIssue]
         rows[label] = {("pairs", "value"): float(len(runs))} | row
     return _table(rows, [*by, f"{ours} less"])
+
+
+def _require_numbers(numbers: Any) -> None:
+    """Raise TrustboError unless a table is from `numbers_of`."""
+    require_kind("numbers", numbers, pd.DataFrame, "give the rows of numbers_of")
+    missing = [name for name in (*_RUN, _FIRST) if name not in numbers]
+    if missing:
+        raise TrustboError(
+            f"numbers has no column {missing[0]!r}; give numbers_of(table) for a table of run_grid."
+        )
 
 
 def _columns(by: str | Sequence[str], numbers: pd.DataFrame) -> list[str]:
@@ -208,7 +221,7 @@ def bootstrap(
 
 def _values(numbers: pd.DataFrame) -> dict[str, np.ndarray]:
     """Return the quantities of the runs, which follow the label columns, keyed by name."""
-    first = numbers.columns.get_loc("regret after 0")
+    first = numbers.columns.get_loc(_FIRST)
     return {name: numbers[name].to_numpy(float) for name in numbers.columns[first:]}
 
 
