@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 import trustbo as tb
 from trustbo import plots
@@ -59,6 +60,43 @@ def test_a_figure_draws_on_new_axes_and_on_those_of_the_user(name, result):
     drawn = np.ravel(draw(result, axes.ravel()[:n]))
     assert list(drawn) == list(axes.ravel()[:n])
     drawn[0].figure.canvas.draw()
+
+
+def draw_wide_maps(ax):
+    """Draw the trust maps of three missions with values for which few and many ticks differ."""
+    workspace = tb.Workspace.from_awareness(np.full((1, 4, 6, 1), 0.5), cell_size=30.0)
+    trust = xr.DataArray(np.linspace(0.55, 0.93, 24).reshape(4, 6), dims=("row", "col"))
+    path = [(0, k) for k in range(6)]
+    of_missions = {
+        "trust_map": trust.expand_dims(iteration=[1, 2, 3]),
+        "path": (("iteration", "step", "cell"), np.array([path] * 3)),
+    }
+    plots.trust_maps(xr.Dataset(of_missions), trust, path, workspace, missions=[1, 2, 3], ax=ax)
+
+
+NARROW = {
+    "trust_maps": (2, 2, 3.2, lambda r, ax: r.plot_maps(missions=[1, 2], ax=ax)),
+    "trust_maps of a wide area": (2, 2, 3.2, lambda r, ax: draw_wide_maps(ax)),
+    "trust_curves": (1, 3, 1.8, lambda r, ax: plots.trust_curves(r.posterior, ax=ax)),
+    "cell_map": (1, 1, 1.6, lambda r, ax: plots.cell_map(r.maps(n_draws=10)["cost"], r.workspace,
+                                                         ax=ax)),
+    "robot_effects": (1, 1, 1.8, lambda r, ax: plots.robot_effects(EFFECTS, ax=ax)),
+    "grid_map": (1, 1, 1.8, lambda r, ax: plots.grid_map(r.workspace, ax=ax)),
+}  # fmt: skip
+"""Figures of 3.5 inches: rows and columns of panels, height in inches, and function."""
+
+
+@pytest.mark.parametrize("name", NARROW)
+def test_labels_of_narrow_figures_are_not_cut_off(name, result):
+    """In the first drawing, nothing reaches the edge."""
+    rows, cols, height, draw = NARROW[name]
+    with mpl.rc_context({"font.size": 8.0}):
+        figure, axes = plt.subplots(rows, cols, figsize=(3.5, height), layout="compressed")
+        draw(result, axes)
+        figure.canvas.draw()
+    drawn = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+    for edge in (drawn[0], drawn[-1], drawn[:, 0], drawn[:, -1]):
+        assert (edge == 255).all()
 
 
 def test_settings_of_matplotlib_stay_as_they_were(result):
@@ -180,7 +218,7 @@ def test_good_values_are_bright_and_assumed_ones_are_masked(result, name):
 def test_a_scale_of_trust_says_that_values_exceed_it(result):
     low = result.trust_map.copy(data=np.linspace(0.5, 0.9, 12).reshape(4, 3))
     high = low + 0.2
-    for values, label in ((low, "0.90"), (high.assign_attrs(low.attrs), "≥ 1")):
+    for values, label in ((low, "0.9"), (high.assign_attrs(low.attrs), "≥ 1")):
         ax = plots.cell_map(values.rename("trust"), result.workspace)
         (bar,) = (other for other in ax.figure.axes if other is not ax)
         ax.figure.canvas.draw()

@@ -229,7 +229,7 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
         panel.plot(x, y, marker, color=colour, markerfacecolor=background(), label=str(name))
         panel.plot(x[odd], y[odd], marker, color=colour)
 
-    panel.set(xlabel="mission", ylabel="effect on contact at full sight")
+    panel.set(xlabel="mission", ylabel="effect on contact\nat full sight")
     panel.xaxis.set_major_locator(MaxNLocator(integer=True))
     add_legend(axes, panel.get_legend_handles_labels()[0])
     return panel

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 
 from trustbo.errors import require_kind
-from trustbo.plots.style import figure_of, panels, styled
+from trustbo.plots.style import figure_of, in_lines, panels, round_ticks, styled
 from trustbo.workspace import Workspace
 
 _WIDTH = 7.0
@@ -51,7 +51,8 @@ def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
     if workspace.terrain is not None:
         light = ListedColormap(colormaps["YlOrBr"](np.linspace(0.0, 0.55, 256)))
         image = panel.pcolormesh(x, y, grid.cell_means(workspace.terrain["dem"]), cmap=light)
-        panel.figure.colorbar(image, ax=panel, label="mean height (m)")
+        label = in_lines("mean height (m)", [panel])
+        panel.figure.colorbar(image, ax=panel, label=label, ticks=round_ticks())
 
     closed = np.ma.masked_array(np.ones(grid.shape), workspace.passable.values)
     panel.pcolor(x, y, closed, cmap=ListedColormap(["0.8"]), hatch="///", edgecolor="0.6", lw=0.0)

@@ -24,10 +24,12 @@ from trustbo.plots.style import (
     as_text,
     background,
     figure_of,
+    in_lines,
     ink,
     is_broad,
     outlined,
     panels,
+    round_ticks,
     styled,
 )
 from trustbo.terrain import pixel_size
@@ -350,8 +352,8 @@ def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
 
 def colour_bar(axes: Sequence[Axes] | np.ndarray, image: Any, label: str, **options: Any) -> Any:
     """Draw a colour bar beside axes, and return it."""
-    bar = axes[0].figure.colorbar(image, ax=list(axes), pad=0.02, **options)
-    bar.set_label(label)
+    bar = axes[0].figure.colorbar(image, ax=list(axes), pad=0.02, ticks=round_ticks(), **options)
+    bar.set_label(in_lines(label, axes) if bar.orientation == "vertical" else label)
     return bar
 
 

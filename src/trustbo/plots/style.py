@@ -1,6 +1,7 @@
 """Style, colours and axes of all figures."""
 
 import math
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -13,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import AutoLocator, MaxNLocator
 
 from trustbo.errors import TrustboError
 
@@ -39,6 +41,16 @@ GREY = "0.55"
 """Colour of impassable cells and auxiliary lines, for light and dark backgrounds."""
 PAGE = 7.6
 """Page width in inches, which is the maximum width of a new figure."""
+N_INTERVALS = 5
+"""Largest number of intervals between ticks.
+
+The number does not depend on the size of the axes: Matplotlib computes the layout first, and labels
+of other ticks that it chose afterwards could be cut off.
+"""
+_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+"""Steps between ticks, up to a power of ten."""
+_LETTERS = 15.0
+"""Number of letters of an axis label per inch, a little less than fit."""
 _BROAD = 1.5
 """Width of a panel, in inches, from which a title of two words and a legend fit into it."""
 _WIDE = 5.0
@@ -85,6 +97,7 @@ def panels(
             panel.tick_params(labelsize=RC["xtick.labelsize"])
             for text in (panel.xaxis.label, panel.yaxis.label):
                 text.set_size(RC["axes.labelsize"])
+            _choose_ticks(panel)
         return given[:n]
 
     cols = min(n, columns)
@@ -98,7 +111,32 @@ def panels(
 
     for unused in axes.ravel()[n:]:
         unused.remove()
+    for panel in axes.ravel()[:n]:
+        _choose_ticks(panel)
     return axes.ravel()[:n]
+
+
+def _choose_ticks(panel: Axes) -> None:
+    """Replace Matplotlib's default choice of ticks, which depends on the size of the axes."""
+    for axis in (panel.xaxis, panel.yaxis):
+        if type(axis.get_major_locator()) is AutoLocator:
+            axis.set_major_locator(round_ticks())
+
+
+def round_ticks() -> MaxNLocator:
+    """Return a choice of ticks at round numbers, which does not depend on the size of the axes."""
+    return MaxNLocator(N_INTERVALS, steps=_STEPS)
+
+
+def in_lines(label: str, axes: Sequence[Axes] | np.ndarray) -> str:
+    """Break the label of a vertical axis beside axes into lines that are shorter than these."""
+    low = min(panel.get_position().y0 for panel in axes)
+    high = max(panel.get_position().y1 for panel in axes)
+    most = int(_LETTERS * figure_of(axes).get_figheight() * (high - low))
+    lines = (
+        textwrap.wrap(line, max(most, 1), break_long_words=False) for line in label.split("\n")
+    )
+    return "\n".join(part for parts in lines for part in parts)
 
 
 def figure_of(axes: Sequence[Axes] | np.ndarray) -> Figure:
