@@ -324,3 +324,47 @@ def test_tables_of_xarray_are_read_as_frames_are(field):
         read_driven(field, *of) for of in (tables, [table.to_xarray() for table in tables])
     )
     np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
+
+
+def unbroken(times, start=0.0, hz=10):
+    """Poses of 60 s along the planned cells, and detections of the lead by both robots."""
+    n = 60 * hz + 1
+    t = np.arange(n) / hz
+    poses = pd.concat([pd.DataFrame({"t": start + t, "robot": name}) for name in ("L", *NAMES)])
+    poses["x"] = np.tile(10.0 + t, 3)
+    poses["y"] = np.tile(10.0 + t, 3)
+    seen = [pd.DataFrame({"t": start + times, "watcher": name, "seen": "L"}) for name in NAMES]
+    return poses, pd.concat(seen)
+
+
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.95])
+@pytest.mark.parametrize("hz", [1, 5, 10, 20, 30])
+def test_a_detection_at_each_reading_is_contact_in_all_ticks(field, hz, phase, start):
+    times = (np.arange(60 * hz) + phase) / hz
+    one = read_driven(field, *unbroken(times, start, hz), tick=1.0 / hz)
+    assert one.contact_rate.min() == 1.0
+    assert one.n_ticks.sum(0).max() == pytest.approx(50 * hz, abs=1)
+
+
+@pytest.mark.parametrize("interval", [1.0, 1.01, 0.99])
+@pytest.mark.parametrize("phase", [0.0, 0.5, 0.98])
+def test_errors_of_times_at_the_edges_of_ticks_are_no_lost_contact(field, interval, phase):
+    rng = np.random.default_rng(0)
+    times = np.arange(phase, 60.0, interval)
+    times = np.abs(times + rng.normal(0.0, 0.05, len(times)))
+    one = read_driven(field, *unbroken(times))
+    assert one.contact_rate.mean() > 0.96
+
+
+@pytest.mark.parametrize("interval", [1.05, 1.2, 1.3, 1.45, 2.0])
+@pytest.mark.parametrize("of", [("a", "b"), ("b",)])
+def test_readings_further_apart_than_a_tick_are_warned_of_with_the_remedy(field, interval, of):
+    poses, seen = unbroken(np.arange(0.5, 60.0))
+    _, rare = unbroken(np.arange(0.03, 60.0, interval))
+    seen = pd.concat([seen[~seen.watcher.isin(of)], rare[rare.watcher.isin(of)]])
+    with pytest.warns(UserWarning, match=f"pass tick={interval:g}"):
+        read_driven(field, poses, seen)
+
+    one = read_driven(field, poses, seen, tick=interval)
+    assert one.contact_rate.min() == 1.0

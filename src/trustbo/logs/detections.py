@@ -13,8 +13,18 @@ _OUTSIDE = 0.05
 """Share of a robot's detections that may lie outside the time of the poses without a warning."""
 _OFTEN = 0.03
 """Share of intervals between detections that may be shorter than those of the detector."""
+_LONGER = 1.04
+"""Interval between readings, in ticks, from which ticks without a reading are warned of."""
+_LEAST_SINGLE = 0.2
+"""Least share of the times between detections that are one interval of the detector."""
 _MANY = 4
 """Number of detections that may have another cause, such as a tree or a repeated message."""
+_NEARBY = 21
+"""Number of successive detections from which the phase of a detector is estimated."""
+_LEAST_REGULAR = 0.2
+"""Mean resultant length of phases below which the phase of nearby detections is unknown."""
+_JUST_BEFORE = 0.02
+"""Time before the start of a tick, in ticks, at which a reading still counts as at its start."""
 _LEAST_EXTENT = 0.1
 """Extent of all poses below which their unit is doubted, m."""
 
@@ -47,6 +57,40 @@ def read_tables(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame
             f"{_listed(looks['lead'])}. If no robot was detected, give a table without rows."
         )
     return tracks, between, looks.loc[~known]
+
+
+def ticks_of(looks: pd.DataFrame, start: float, tick: float) -> np.ndarray:
+    """Return the tick of each detection, shape (detection,).
+
+    Readings at intervals of a tick may all lie close to the edges of ticks that begin at `start`.
+    Small errors of their times would then leave some ticks without a reading and others with two.
+    The edges are therefore placed half a tick away from the usual phase of each pair's readings.
+    """
+    ordered = looks.assign(at=(looks["t"] - start) / tick).sort_values("t")
+    pairs = ordered.groupby(["robot", "lead"])["at"]
+    return pairs.transform(_ticks_of_pair).reindex(looks.index).to_numpy()
+
+
+def _ticks_of_pair(at: pd.Series) -> np.ndarray:
+    """Return the ticks of one pair's detections, whose sorted times are in ticks since the start.
+
+    A detection at time k + phase belongs to tick k. The phase is the circular mean over nearby
+    detections, because clocks drift, or over all detections if those nearby are irregular.
+    """
+    turn = np.exp(2j * np.pi * at.to_numpy())
+    of_all = turn.mean()
+    nearby = _rolling_mean(np.real(turn)) + 1j * _rolling_mean(np.imag(turn))
+
+    phase = (np.angle(of_all) / (2.0 * np.pi) + _JUST_BEFORE) % 1.0 - _JUST_BEFORE
+    drift = np.angle(nearby * np.conj(of_all)) / (2.0 * np.pi)
+    is_regular = np.abs(nearby) > _LEAST_REGULAR
+    return np.rint(at.to_numpy() - phase - np.where(is_regular, drift, 0.0))
+
+
+def _rolling_mean(values: np.ndarray) -> np.ndarray:
+    """Return the means of `_NEARBY` successive values, or of fewer at the ends."""
+    windows = pd.Series(values).rolling(_NEARBY, min_periods=1, center=True)
+    return np.asarray(windows.mean())
 
 
 def _listed(names: Iterable[str]) -> str:
@@ -113,18 +157,45 @@ def warn_of_times(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) -> Non
             "ignored; check that both tables have the same clock."
         )
 
-    gaps = looks.sort_values("t").groupby(["robot", "lead"])["t"].diff().dropna().to_numpy()
-    short = gaps[gaps < 0.5 * tick]
-    apart = float(np.quantile(gaps, _OFTEN)) if gaps.size else np.nan
-    if apart > 1.5 * tick:
+    _warn_of_intervals(looks, tick)
+
+
+def _warn_of_intervals(looks: pd.DataFrame, tick: float) -> None:
+    """Warn of readings that are further apart than a tick, or much closer together."""
+    ordered = looks.sort_values("t")
+    gaps = ordered.groupby(["robot", "lead"])["t"].diff().to_numpy()
+    watchers = ordered["robot"].to_numpy()
+    intervals = {name: _interval(gaps[watchers == name]) for name in np.unique(watchers)}
+    slow = {str(name): apart for name, apart in intervals.items() if apart > _LONGER * tick}
+
+    all_gaps = gaps[~np.isnan(gaps)]
+    short = all_gaps[all_gaps < 0.5 * tick]
+    least = float(np.quantile(all_gaps, _OFTEN)) if all_gaps.size else np.nan
+    if slow or least > 1.5 * tick:
+        apart = max(slow.values(), default=least)
+        by = f"by {_listed(slow)} " if slow else "of one robot by another "
         warn(
-            f"detections of one robot by another are at least {apart:g} s apart, but every tick of "
-            f"{tick:g} s without a detection counts as lost contact; pass tick={apart:g}."
+            f"detections {by}are {apart:.4g} s or more apart, but every tick of {tick:g} s without "
+            f"a detection counts as lost contact; pass tick={apart:.4g}."
         )
-    elif len(short) > max(_OFTEN * len(gaps), _MANY):
+    elif len(short) > max(_OFTEN * len(all_gaps), _MANY):
         apart = float(np.quantile(short, 0.05))
         warn(
             f"detections of one robot by another are only {apart:.3g} s apart, but one detection "
             f"counts as contact in a whole tick of {tick:g} s; pass the interval between two "
             f"readings of the detector, such as tick={apart:.3g}."
         )
+
+
+def _interval(gaps: np.ndarray) -> float:
+    """Return the interval between readings of a detector, s; NaN if it is unknown.
+
+    Times between detections are multiples of the interval, because some readings detect nothing.
+    """
+    known = gaps[~np.isnan(gaps)]
+    if not known.size:
+        return np.nan
+
+    single = known[known < 1.5 * np.quantile(known, _OFTEN)]
+    is_known = len(single) > max(_MANY, _LEAST_SINGLE * len(known))
+    return float(np.median(single)) if is_known else np.nan

@@ -9,13 +9,15 @@ import pandas as pd
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.logs.crossings import crossings_of
-from trustbo.logs.detections import read_tables, warn_of_names, warn_of_times
+from trustbo.logs.detections import read_tables, ticks_of, warn_of_names, warn_of_times
 from trustbo.logs.poses import GAP, UNITS, poses_at, track_of
 from trustbo.workspace import Workspace
 
 _FEATURES = ("near", "ahead")
 _AHEAD = np.pi / 6.0
 """Largest angle between the heading of a robot and a lead ahead of it, rad."""
+_ROUNDING = 1e-3
+"""Part of a tick by which rounded times may shorten a log; Unix times have steps of 2.4e-7 s."""
 
 
 def read_tracks(
@@ -32,9 +34,10 @@ def read_tracks(
 
     The contact rate of a robot in a bound is the fraction of ticks with a detection in which the
     robot is the `watcher` and the lead is `seen`, counting only the `n_ticks` ticks in which both
-    poses are known. Poses are interpolated if they are at most 5 s apart. Phases of a bound are not
-    distinguished: while T2 closes up, contact means that the lead detects the robot, so exchange
-    `watcher` and `seen` in the lead's detections of this phase.
+    poses are known. The ticks of each watcher are shifted by less than a tick, so that its readings
+    lie in the middle of them. Poses are interpolated if they are at most 5 s apart. Phases of a
+    bound are not distinguished: while T2 closes up, contact means that the lead detects the robot,
+    so exchange `watcher` and `seen` in the lead's detections of this phase.
 
     With a workspace, the result is one mission for `Campaign.tell`, with the robots and features of
     the workspace and without measured awareness. A bound begins where the lead enters the next cell
@@ -91,13 +94,13 @@ def read_tracks(
     leads = _leads(lead, robots, workspace)
 
     t = tracks["t"].to_numpy()
-    n = int(np.ptp(t) / tick + 1e-9)
+    n = int(np.ptp(t) / tick + _ROUNDING)
     if n < 1:
         raise TrustboError(f"the log of {np.ptp(t):.3g} s is shorter than a tick; give {UNITS}.")
 
     times = t.min() + (np.arange(n) + 0.5) * tick
     places = pd.concat([poses_at(track_of(tracks, name), times) for name in robots])
-    looks["tick"] = np.floor((looks["t"] - t.min()) / tick + 1e-9)
+    looks = looks.assign(tick=ticks_of(looks, t.min(), tick))
     pairs = _pairs(places, looks)
 
     missions = []
