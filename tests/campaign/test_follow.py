@@ -1,6 +1,7 @@
 """A mission that is followed tick by tick: its trust, what is ahead, and what it becomes."""
 
 import json
+from functools import partial
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
@@ -250,8 +251,13 @@ def example(name):
     return module
 
 
+def taking():
+    """The function of the example of a ROS node, for one mission."""
+    return partial(example("ros2_node").take, held=[])
+
+
 def test_the_example_of_a_ros_node_makes_the_mission_of_its_messages():
-    take, campaign = example("ros2_node").take, begun(n_missions=0)
+    take, campaign = taking(), begun(n_missions=0)
     follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
     seen, path = looks(len(follower.path) - 1), follower.path
     t, over = 0.0, take(follower, robots, "bound", json.dumps({"bound": 0, "cell": path[0]}), 0.0)
@@ -273,7 +279,7 @@ def test_the_example_of_a_ros_node_makes_the_mission_of_its_messages():
 
 
 def test_the_example_of_a_ros_node_replans_after_a_bound_that_failed():
-    take, campaign = example("ros2_node").take, begun(n_missions=0)
+    take, campaign = taking(), begun(n_missions=0)
     follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
     start, blocked, *_ = planned = follower.path
     take(follower, robots, "bound", '{"bound": 1}', 0.0)
@@ -295,7 +301,7 @@ def test_the_example_of_a_ros_node_replans_after_a_bound_that_failed():
 
 @pytest.mark.parametrize("status", ["tipped", "aborted"])
 def test_the_example_of_a_ros_node_ends_a_mission_that_cannot_go_on(status):
-    take, campaign = example("ros2_node").take, begun(n_missions=0)
+    take, campaign = taking(), begun(n_missions=0)
     follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
     path = follower.path
     take(follower, robots, "bound", '{"bound": 1}', 0.0)
@@ -305,7 +311,7 @@ def test_the_example_of_a_ros_node_ends_a_mission_that_cannot_go_on(status):
 
 
 def test_the_example_of_a_ros_node_is_told_between_bounds_that_the_mission_ends():
-    take, campaign = example("ros2_node").take, begun(n_missions=0)
+    take, campaign = taking(), begun(n_missions=0)
     follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
     take(follower, robots, "bound", '{"bound": 1}', 0.0)
     assert not take(follower, robots, "status", "stuck", 5.0)
@@ -317,11 +323,42 @@ def test_the_example_of_a_ros_node_ends_a_mission_whose_goal_cannot_be_reached(m
     def unreachable(self, *args, **options):
         raise tb.NoPathError("no path")
 
-    take, campaign = example("ros2_node").take, begun(n_missions=0)
+    take, campaign = taking(), begun(n_missions=0)
     follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
     monkeypatch.setattr(tb.Follower, "replan", unreachable)
     take(follower, robots, "bound", '{"bound": 1}', 0.0)
     assert take(follower, robots, "status", "stuck", 5.0)
+
+
+@pytest.mark.parametrize("status", ["ok", "stuck"])
+def test_the_example_of_a_ros_node_accepts_a_status_just_after_the_next_marker(status):
+    take, campaign = taking(), begun(n_missions=0)
+    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    path = follower.path
+    take(follower, robots, "bound", '{"bound": 1}', 0.0)
+    take(follower, robots, "r1", True, 1.0)
+    take(follower, robots, "bound", json.dumps({"bound": 2, "cell": path[2]}), 20.0)
+    take(follower, robots, "r1", True, 20.004)
+    assert not take(follower, robots, "status", status, 20.005)
+
+    assert follower.running
+    assert [(bound.status, bound.duration[0]) for bound in follower.bounds] == [(status, 20.0)]
+    take(follower, robots, "r1", False, 21.0)
+    take(follower, robots, "status", "ok", 40.0)
+    assert follower.bounds[1].contact_rate[0] == 0.5
+    assert follower.bounds[1].duration[0] == 20.0
+
+
+def test_the_example_of_a_ros_node_leaves_later_statuses_to_the_new_bound():
+    take, campaign = taking(), begun(n_missions=0)
+    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    for k, t in ((1, 0.0), (2, 20.0), (3, 40.0)):
+        take(follower, robots, "bound", json.dumps({"bound": k, "cell": follower.path[k]}), t)
+        take(follower, robots, "r1", True, t + 0.2)
+        take(follower, robots, "r1", True, t + 0.4)
+    take(follower, robots, "status", "stuck", 40.5)
+    assert [bound.status for bound in follower.bounds] == ["ok", "ok", "stuck"]
+    assert [bound.n_ticks[0] for bound in follower.bounds] == [2.0, 2.0, 2.0]
 
 
 def test_the_example_for_foxglove_sends_trust_by_robot():

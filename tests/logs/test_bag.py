@@ -189,3 +189,92 @@ def test_a_bag_may_lie_in_the_home_folder(driven, workspace, tmp_path, monkeypat
     monkeypatch.setenv("HOME", str(tmp_path))
     record(driven, tmp_path / "log.bag")
     assert len(read_bag("~/log.bag", workspace)) == 2
+
+
+ROBOTS = ("r1", "r2")
+
+
+def said(*statuses, hz=2.0, seconds=60.0):
+    """A log of three bounds of 20 s with contact all the time, and statuses (seconds, text)."""
+    log = Log()
+    log.bound(1.0, 0, 2, 0)
+    for k, cell in enumerate([(1, 0), (1, 1), (0, 2)], start=1):
+        log.bound(20.0 * k - 18.0, k, *cell)
+    for robot in ROBOTS:
+        log.contact(robot, *((2.25 + i / hz, True) for i in range(int(seconds * hz))))
+    for time, text in statuses:
+        log.text(time, "/mission/status", text)
+    log.messages.sort(key=lambda message: message[0])
+    return log
+
+
+@pytest.mark.parametrize("lag", [-0.005, 0.0, 0.005, 0.2])
+@pytest.mark.parametrize("hz", [2.0, 10.0])
+@pytest.mark.parametrize("status", ["ok", "stuck"])
+def test_a_status_just_after_the_next_marker_is_that_of_the_bound_before(
+    status, hz, lag, workspace, tmp_path
+):
+    if (status, hz, lag) == ("stuck", 10.0, 0.2):
+        lag = 0.1
+    log = said((22.0 + lag, "ok"), (42.0 + lag, status), (62.0 + lag, "ok"), hz=hz)
+    (one,) = read_bag(log.save(tmp_path / "bag"), workspace)
+    assert one.statuses == ["ok", status, "ok"]
+    np.testing.assert_array_equal(one.contact_rate, 1.0)
+    np.testing.assert_allclose(one.n_ticks, 20.0 * hz, atol=3.0)
+    np.testing.assert_allclose(one.duration, 20.0, atol=0.25)
+
+
+def test_a_failure_after_contact_messages_of_a_bound_is_its_own(workspace, tmp_path):
+    log = said((42.8, "stuck"), hz=10.0, seconds=42.0)
+    (one,) = read_bag(log.save(tmp_path / "bag"), workspace)
+    assert one.statuses == ["ok", "ok", "stuck"]
+
+
+def test_a_status_may_follow_the_marker_of_the_next_mission(workspace, tmp_path):
+    log = said((22.0, "ok"), (42.0, "ok"), (62.01, "stuck"))
+    log.bound(62.0, 0, 2, 0)
+    log.bound(62.0, 1, 1, 0)
+    log.contact("r1", (63.0, True))
+    log.messages.sort(key=lambda message: message[0])
+    first, second = read_bag(log.save(tmp_path / "bag"), workspace)
+    assert first.statuses == ["ok", "ok", "stuck"]
+    assert second.statuses == ["ok"]
+
+
+def test_different_statuses_of_a_bound_are_refused(workspace, tmp_path):
+    log = said((21.0, "ok"), (30.0, "ok"), (41.0, "stuck"), (61.0, "ok"))
+    with pytest.raises(TrustboError, match="bound 2"):
+        read_bag(log.save(tmp_path / "bag"), workspace)
+
+    log = said((21.0, "ok"), (41.0, "stuck"), (61.0, "stuck"), (61.5, "aborted"))
+    (one,) = read_bag(log.save(tmp_path / "aborted"), workspace)
+    assert one.statuses == ["ok", "stuck", "stuck"]
+
+
+@pytest.mark.parametrize(
+    "statuses",
+    [
+        [(t + 0.4, "ok") for t in range(2, 62)],  # at 1 Hz
+        [(25.5, "ok"), (45.5, "ok"), (61.0, "ok")],  # 3.5 s late
+        [(3.0, "ok"), (41.0, "ok"), (61.0, "ok")],
+    ],
+)
+def test_a_status_that_ends_a_bound_during_contact_messages_is_warned_of(
+    statuses, workspace, tmp_path
+):
+    path = said(*statuses, hz=10.0).save(tmp_path / "bag")
+    with pytest.warns(UserWarning, match="contact messages continue"):
+        read_bag(path, workspace)
+
+
+def test_pauses_after_a_status_are_not_warned_of(workspace, tmp_path):
+    log = said((14.0, "ok"), (35.0, "ok"), (50.0, "ok"), (50.1, "ok"), seconds=200.0)
+    (one,) = read_bag(log.save(tmp_path / "bag"), workspace)
+    np.testing.assert_allclose(one.duration[:, 0], [12.0, 13.0, 8.0])
+
+
+def test_a_bound_without_contact_messages_is_warned_of(workspace, tmp_path):
+    path = said((61.0, "ok"), seconds=38.0).save(tmp_path / "bag")
+    with pytest.warns(UserWarning, match="no contact message.*bound 3 of mission 1"):
+        (one,) = read_bag(path, workspace)
+    assert np.isnan(one.contact_rate[2]).all()

@@ -8,9 +8,10 @@
                       robot detects the lead or, while T2 closes up, the lead detects the robot
 
 A bound lasts from its marker to its status or, without a status, to the last contact message
-before the next marker. Its contact rate is the fraction of a robot's ticks with contact; NaN ticks
-are ignored. If the last bound is ok but does not reach the end of the planned path, the mission is
-"aborted".
+before the next marker. A status may arrive up to 1 s after the next marker if the bound has no
+other status; the bound then ends at this marker. The contact rate of a bound is the fraction of a
+robot's ticks with contact; NaN ticks are ignored. If the last bound is ok but does not reach the
+end of the planned path, the mission is "aborted".
 """
 
 import json
@@ -25,6 +26,7 @@ import pandas as pd
 from trustbo.data import Cell, Mission, require_unit_interval
 from trustbo.errors import TrustboError, one_line, require_pair, require_whole
 from trustbo.files import FilePath, to_path
+from trustbo.logs.statuses import ends_of, warn_of_ends
 from trustbo.logs.table import read_table
 from trustbo.workspace import Workspace
 
@@ -58,7 +60,12 @@ def read_bag(
 
     Raises:
         TrustboError: rosbags is not installed, the path is not a complete bag, a topic is missing
-            or of another type, markers are out of order, or `Mission` rejects the data.
+            or of another type, markers are out of order, a bound has different statuses, or
+            `Mission` rejects the data.
+
+    Warns:
+        UserWarning: A status ends a bound although contact messages continue, or no contact message
+            was sent in a bound.
 
     Example:
         >>> missions = tb.logs.read_bag("log.bag", workspace)
@@ -73,7 +80,8 @@ def read_bag(
     of_topic = {contact.replace("{robot}", robot): robot for robot in workspace.team.names}
     messages = _messages(paths, of_bounds, of_statuses, contact, [*of_topic])
 
-    seen = messages.loc[messages["topic"].isin([*of_topic])].astype({"data": float}).dropna()
+    looks = messages.loc[messages["topic"].isin([*of_topic])].astype({"data": float})
+    seen = looks.dropna()
     require_unit_interval(f"messages on {contact}", seen["data"].to_numpy())
     ticks = seen.assign(robot=seen["topic"].map(of_topic), contact=seen["data"] > 0.5)
 
@@ -83,7 +91,8 @@ def read_bag(
 
     bounds = pd.DataFrame(markers, columns=["begin", "bound", "cell", "path"])
     bounds["until"] = bounds["begin"].shift(-1, fill_value=_NEVER)
-    missions = bounds.groupby((bounds["bound"] == 0).cumsum())
+    bounds["mission"] = (bounds["bound"] == 0).cumsum()
+    missions = bounds.groupby("mission")
 
     if bounds.empty or (bounds["bound"] != missions.cumcount()).any():
         raise TrustboError(
@@ -91,8 +100,10 @@ def read_bag(
             f"{one_line(bounds['bound'].tolist())}. Leave out markers that were recorded twice."
         )
 
+    ends = ends_of(bounds, statuses, ticks)
+    warn_of_ends(bounds, ends, looks.index)
     tables = [
-        _table(driven, ticks, statuses, workspace.team.names).assign(mission=mission)
+        _table(driven, ticks, ends, workspace.team.names).assign(mission=mission)
         for mission, driven in missions
         if len(driven) > 1
     ]
@@ -206,7 +217,7 @@ def _marker(time: Any, text: Any) -> tuple[int, int, Cell, tuple[Cell, ...]]:
 
 
 def _table(
-    bounds: pd.DataFrame, ticks: pd.DataFrame, statuses: pd.Series, robots: Sequence[str]
+    bounds: pd.DataFrame, ticks: pd.DataFrame, ends: pd.DataFrame, robots: Sequence[str]
 ) -> pd.DataFrame:
     """Return a mission as a table: rows of its planned cells, then rows of its bounds."""
     driven = tuple(bounds["cell"])
@@ -218,17 +229,18 @@ def _table(
     cells = [(0, *driven[0]), *((k, *cell) for k, cell in enumerate(path))]
     tables = [pd.DataFrame(cells, columns=["bound", "row", "col"]).drop_duplicates()]
 
-    for begin, k, (row, col), _, until in bounds.iloc[1:].itertuples(index=False):
-        ended = statuses.loc[begin + 1 : until].iloc[:1]
-        if len(ended):
-            end = ended.index[0]
+    of_bounds = ends.drop_duplicates("row").set_index("row")
+    for i, begin, k, (row, col), _, until, _ in bounds.iloc[1:].itertuples():
+        has_status = i in of_bounds.index
+        if has_status:
+            end = of_bounds.loc[i, "end"]
             looks = ticks.loc[begin + 1 : end]
         else:
             looks = ticks.loc[begin + 1 : until]
             end = max(looks.index, default=begin)
 
         duration = (end - begin) / _NANOSECONDS if end > begin else np.nan
-        status = ended.iloc[0] if len(ended) else "ok"
+        status = of_bounds.loc[i, "status"] if has_status else "ok"
         if status == "ok" and k == len(driven) - 1 and not reaches_end:
             status = "aborted"  # no record of the reason
 
