@@ -32,7 +32,10 @@ def read_mrclam(run):
     poses.csv and detections.csv.
     """
     if not (run / "Barcodes.dat").exists():
-        return [pd.read_csv(next(run.glob(f"{name}.csv*"))) for name in ("poses", "detections")]
+        poses, seen = (
+            pd.read_csv(next(run.glob(f"{name}.csv*"))) for name in ("poses", "detections")
+        )
+        return poses, seen[["t", "watcher", "seen"]]
     subject = {int(code): int(n) for n, code in np.loadtxt(run / "Barcodes.dat")[:, :2]}
     poses, detections = [], []
     for i in range(1, 6):

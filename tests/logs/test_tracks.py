@@ -368,3 +368,33 @@ def test_readings_further_apart_than_a_tick_are_warned_of_with_the_remedy(field,
 
     one = read_driven(field, poses, seen, tick=interval)
     assert one.contact_rate.min() == 1.0
+
+
+@pytest.mark.parametrize(
+    "column",
+    [lambda t: t % 2 < 1, lambda t: (t % 2 < 1) * 1, lambda t: np.where(t % 2 < 1, "yes", "no"),
+     lambda t: np.where(t % 2 < 1, 3.0, np.nan), lambda t: t % 2 / 2.5],
+)  # fmt: skip
+def test_columns_that_may_mark_rows_without_detections_are_refused(field, column, tmp_path):
+    poses, seen = unbroken(np.arange(0.5, 60.0))
+    scans = seen.assign(detected=column(seen.t))
+    scans.to_csv(tmp_path / "scans.csv", index=False)
+    for table in (scans, tmp_path / "scans.csv"):
+        with pytest.raises(TrustboError, match="detected"):
+            read_driven(field, poses, table)
+
+
+def test_numbers_of_rows_are_no_further_column(field, tmp_path):
+    poses, seen = unbroken(np.arange(0.5, 60.0))
+    numbered = seen.reset_index(drop=True).rename_axis("scan")
+    numbered.to_csv(tmp_path / "seen.csv")
+    for table in (numbered, numbered.to_xarray(), tmp_path / "seen.csv"):
+        assert read_driven(field, poses, table).contact_rate.min() == 1.0
+
+
+def test_robots_that_only_the_lead_detects_are_warned_of(field):
+    poses, seen = unbroken(np.arange(0.5, 60.0))
+    swapped = seen.rename(columns={"watcher": "seen", "seen": "watcher"})
+    with pytest.warns(UserWarning, match="a, b never .* 120 detections"):
+        assert read_driven(field, poses, swapped).contact_rate.max() == 0.0
+    read_driven(field, poses, pd.concat([seen, swapped]))

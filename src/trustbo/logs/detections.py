@@ -17,6 +17,8 @@ _LONGER = 1.04
 """Interval between readings, in ticks, from which ticks without a reading are warned of."""
 _LEAST_SINGLE = 0.2
 """Least share of the times between detections that are one interval of the detector."""
+_READ = ("t", "watcher", "seen")
+"""Columns of a table of detections."""
 _MANY = 4
 """Number of detections that may have another cause, such as a tree or a repeated message."""
 _NEARBY = 21
@@ -36,6 +38,7 @@ def read_tables(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame
     """
     where = Columns(poses, "the table of poses")
     seen = Columns(detections, "the table of detections", may_be_empty=True)
+    _require_detections(seen)
     t, seen_at = seconds_of(where, seen)
     tracks = pd.DataFrame({"t": t, "robot": where.texts("robot", blank=False)})
     tracks["x"] = where.numbers("x", blank=False)
@@ -57,6 +60,28 @@ def read_tables(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame
             f"{_listed(looks['lead'])}. If no robot was detected, give a table without rows."
         )
     return tracks, between, looks.loc[~known]
+
+
+def _require_detections(table: Columns) -> None:
+    """Raise TrustboError for a further column, which may mark rows that are no detections.
+
+    Numbers of rows, such as the index of an xarray Dataset, are accepted.
+    """
+    read = [table.find(name) for name in _READ]
+    others = [name for name in table.frame if name not in read]
+    further = [name for name in others if not _numbers_rows(table.frame[name])]
+    if further:
+        raise TrustboError(
+            f"{table.what} also has {_listed(further)}, but every row counts as a detection; keep "
+            f"only rows in which the robot was detected, and the columns {', '.join(_READ)}."
+        )
+
+
+def _numbers_rows(column: pd.Series) -> bool:
+    """Return whether a column has increasing whole numbers."""
+    numbers = pd.Series(pd.to_numeric(column, errors="coerce")).astype(float)
+    is_whole = bool((np.floor(numbers) == numbers).all())
+    return is_whole and numbers.is_monotonic_increasing and numbers.is_unique
 
 
 def ticks_of(looks: pd.DataFrame, start: float, tick: float) -> np.ndarray:
@@ -136,6 +161,23 @@ def warn_of_names(
         )
     if silent := [name for name in dict.fromkeys([*team, *leads]) if name not in named]:
         warn(f"no detection names {', '.join(silent)}; their contact is 0.")
+    _warn_of_swapped(looks, leads, team)
+
+
+def _warn_of_swapped(looks: pd.DataFrame, leads: Sequence[str], team: Sequence[str]) -> None:
+    """Warn of robots that never detect the only lead, although it detects them."""
+    if len(leads) > 1:
+        return
+
+    watchers = looks.loc[looks["lead"].isin(leads), "robot"].unique()
+    by_lead = looks.loc[looks["robot"].isin(leads) & looks["lead"].isin(team), "lead"]
+    ignored = by_lead[~by_lead.isin(watchers)]
+    if len(ignored):
+        warn(
+            f"{_listed(ignored)} never detects the lead {_listed(leads)}, so the contact is 0; "
+            f"{len(ignored)} detections by the lead are ignored. Exchange watcher and seen if they "
+            "are swapped, or for detections by the lead while T2 closes up."
+        )
 
 
 def warn_of_times(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) -> None:

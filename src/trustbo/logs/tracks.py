@@ -56,8 +56,8 @@ def read_tracks(
             if known, heading (rad from east, anticlockwise); by default, the heading is the
             direction of motion.
         detections: Table in any of the same forms with the columns t (on the same clock), watcher
-            and seen. Detections of objects without poses are ignored. A table without rows means
-            that no robot detected another.
+            and seen. Each row is a detection, so further columns are refused. Detections of objects
+            without poses are ignored. A table without rows means that no robot detected another.
         workspace: Map of the cells that the lead enters.
         path: Planned path, such as `campaign.ask().path`; it needs a workspace.
         lead: Name of the lead. By default, it is the robot that is not in the workspace's team;
@@ -69,9 +69,9 @@ def read_tracks(
         One mission for each lead that has a complete bound.
 
     Raises:
-        TrustboError: Values, times, poses or units are invalid, no detection is between two robots
-            with poses, the lead is unknown, it misses a cell of the given path, or the log has no
-            complete bound.
+        TrustboError: Values, times, poses or units are invalid, the detections have a further
+            column, no detection is between two robots with poses, the lead is unknown, it misses a
+            cell of the given path, or the log has no complete bound.
 
     Warns:
         UserWarning: A watcher is unknown, detections lie outside the time of the poses, their
