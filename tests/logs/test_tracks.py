@@ -398,3 +398,13 @@ def test_robots_that_only_the_lead_detects_are_warned_of(field):
     with pytest.warns(UserWarning, match="a, b never .* 120 detections"):
         assert read_driven(field, poses, swapped).contact_rate.max() == 0.0
     read_driven(field, poses, pd.concat([seen, swapped]))
+
+
+@pytest.mark.parametrize("heading", [None, np.nan, [0.0, *[np.nan] * 600] * 3])
+def test_robots_that_stand_still_need_no_heading_on_a_map(field, heading):
+    poses, seen = unbroken(np.arange(0.5, 60.0))
+    poses.loc[poses.robot == "b", ["x", "y"]] = 15.0
+    table = poses if heading is None else poses.assign(heading=heading)
+    assert read_driven(field, table, seen).contact_rate.min() == 1.0
+    with pytest.raises(TrustboError, match="heading"):
+        read_tracks(table, seen)

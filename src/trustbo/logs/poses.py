@@ -16,8 +16,11 @@ _FASTEST = 100.0
 """Highest speed that is accepted, m/s."""
 
 
-def track_of(tracks: pd.DataFrame, name: str) -> pd.DataFrame:
-    """Return the poses of one robot, sorted by time, with its unwrapped heading."""
+def track_of(tracks: pd.DataFrame, name: str, *, headings: bool) -> pd.DataFrame:
+    """Return the poses of one robot, sorted by time, with its unwrapped heading.
+
+    If `headings` is False, headings are not checked, and NaN.
+    """
     track = tracks.loc[tracks["robot"] == name]
     _require_order(name, track["t"].to_numpy())
 
@@ -30,12 +33,16 @@ def track_of(tracks: pd.DataFrame, name: str) -> pd.DataFrame:
     moves = speed > _STANDING
     _check_speed(name, t, speed, moves)
 
+    if not headings:
+        return track.assign(heading=np.nan)
+
     if np.isnan(heading).all():
         heading = pd.Series(np.where(moves, course, np.nan)).ffill().bfill().to_numpy()
     if np.isnan(heading).any():
         raise TrustboError(
             f"headings of robot {name!r} are blank in some poses, or in all although it moves at "
-            "less than 1 mm/s; give all headings, times in seconds and positions in metres."
+            "less than 1 mm/s; give all headings, times in seconds and positions in metres, or "
+            "pass the workspace, with which headings are not needed."
         )
     _require_radians(name, heading, course, moves)
     return track.assign(heading=np.unwrap(heading))

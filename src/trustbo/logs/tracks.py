@@ -54,7 +54,7 @@ def read_tracks(
     Args:
         poses: Path of a CSV file, a DataFrame, or a mapping of columns: t (s), robot, x, y (m) and,
             if known, heading (rad from east, anticlockwise); by default, the heading is the
-            direction of motion.
+            direction of motion. Headings are used only without a workspace.
         detections: Table in any of the same forms with the columns t (on the same clock), watcher
             and seen. Each row is a detection, so further columns are refused. Detections of objects
             without poses are ignored. A table without rows means that no robot detected another.
@@ -99,7 +99,8 @@ def read_tracks(
         raise TrustboError(f"the log of {np.ptp(t):.3g} s is shorter than a tick; give {UNITS}.")
 
     times = t.min() + (np.arange(n) + 0.5) * tick
-    places = pd.concat([poses_at(track_of(tracks, name), times) for name in robots])
+    by_robot = [track_of(tracks, name, headings=workspace is None) for name in robots]
+    places = pd.concat([poses_at(track, times) for track in by_robot])
     looks = looks.assign(tick=ticks_of(looks, t.min(), tick))
     pairs = _pairs(places, looks)
 
