@@ -408,3 +408,14 @@ def test_robots_that_stand_still_need_no_heading_on_a_map(field, heading):
     assert read_driven(field, table, seen).contact_rate.min() == 1.0
     with pytest.raises(TrustboError, match="heading"):
         read_tracks(table, seen)
+
+
+@pytest.mark.parametrize("sparse", ["a", "L"])
+def test_detections_that_gaps_of_poses_cost_are_warned_of(field, sparse):
+    poses, seen = unbroken(np.arange(0.5, 60.0))
+    kept = (poses.robot != sparse) | np.isin(poses.t, [*range(13), *range(18, 33), *range(38, 61)])
+    with pytest.warns(UserWarning, match=f"% of the detections by a.* poses of {sparse} .* 6 s"):
+        read_driven(field, poses[kept], seen)
+
+    kept = (poses.robot != sparse) | (poses.t % 5.0 == 0.0)
+    assert read_driven(field, poses[kept], seen).contact_rate.min() == 1.0

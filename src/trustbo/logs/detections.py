@@ -8,9 +8,10 @@ import pandas as pd
 
 from trustbo.errors import TrustboError, warn
 from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
+from trustbo.logs.poses import GAP
 
 _OUTSIDE = 0.05
-"""Share of a robot's detections that may lie outside the time of the poses without a warning."""
+"""Share of a robot's detections that may be at times without poses without a warning."""
 _OFTEN = 0.03
 """Share of intervals between detections that may be shorter than those of the detector."""
 _LONGER = 1.04
@@ -182,14 +183,7 @@ def _warn_of_swapped(looks: pd.DataFrame, leads: Sequence[str], team: Sequence[s
 
 def warn_of_times(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) -> None:
     """Warn of detections outside the time of poses, and of a tick that is not their spacing."""
-    spans = tracks.groupby("robot")["t"].agg(["min", "max"])
-    of_watcher = spans.loc[looks["robot"]].to_numpy()
-    of_lead = spans.loc[looks["lead"]].to_numpy()
-    t = looks["t"].to_numpy()
-    begin = np.maximum(of_watcher[:, 0], of_lead[:, 0])
-    end = np.minimum(of_watcher[:, 1], of_lead[:, 1])
-    outside = np.maximum(begin - t, t - end)
-
+    outside = _time_outside(tracks, looks)
     watchers = looks["robot"].to_numpy()
     shares = {name: (outside[watchers == name] > tick).mean() for name in looks["robot"].unique()}
     if late := [name for name, share in shares.items() if share > _OUTSIDE]:
@@ -200,6 +194,53 @@ def warn_of_times(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) -> Non
         )
 
     _warn_of_intervals(looks, tick)
+
+
+def warn_of_gaps(
+    tracks: pd.DataFrame, looks: pd.DataFrame, pairs: pd.DataFrame, leads: Sequence[str]
+) -> None:
+    """Warn of detections of leads that are ignored because of long times between poses.
+
+    Args:
+        tracks: Poses.
+        looks: Detections with their `tick`.
+        pairs: Each `tick`, `robot` and `lead` with known poses.
+        leads: Robots that are watched.
+    """
+    keys = ["tick", "robot", "lead"]
+    is_known = looks.set_index(keys).index.isin(pairs.set_index(keys).index)
+    has_tick = looks["tick"].between(0, pairs["tick"].max()).to_numpy()
+    is_lost = has_tick & ~is_known & (_time_outside(tracks, looks) <= 0.0)
+
+    of_lead = looks["lead"].isin(leads).to_numpy()
+    watchers = looks["robot"].to_numpy()
+    shares = {name: is_lost[of_lead & (watchers == name)] for name in np.unique(watchers[of_lead])}
+    lost = {str(name): share.mean() for name, share in shares.items() if share.mean() > _OUTSIDE}
+    if not lost:
+        return
+
+    ordered = tracks.sort_values("t")
+    gaps = ordered.groupby("robot")["t"].diff().to_numpy()
+    sparse = ordered.loc[gaps > GAP, "robot"].unique()
+    warn(
+        f"up to {max(lost.values()):.0%} of the detections by {_listed(lost)} are ignored, because "
+        f"poses of {_listed(sparse)} are up to {np.nanmax(gaps):.3g} s "
+        f"apart and are interpolated only over at most {GAP:g} s; add interpolated poses."
+    )
+
+
+def _time_outside(tracks: pd.DataFrame, looks: pd.DataFrame) -> np.ndarray:
+    """Return the time by which detections lie outside the poses of both robots, s; negative inside.
+
+    The shape is (detection,).
+    """
+    spans = tracks.groupby("robot")["t"].agg(["min", "max"])
+    of_watcher = spans.loc[looks["robot"]].to_numpy()
+    of_lead = spans.loc[looks["lead"]].to_numpy()
+    t = looks["t"].to_numpy()
+    begin = np.maximum(of_watcher[:, 0], of_lead[:, 0])
+    end = np.minimum(of_watcher[:, 1], of_lead[:, 1])
+    return np.maximum(begin - t, t - end)
 
 
 def _warn_of_intervals(looks: pd.DataFrame, tick: float) -> None:

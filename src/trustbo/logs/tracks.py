@@ -9,7 +9,13 @@ import pandas as pd
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.logs.crossings import crossings_of
-from trustbo.logs.detections import read_tables, ticks_of, warn_of_names, warn_of_times
+from trustbo.logs.detections import (
+    read_tables,
+    ticks_of,
+    warn_of_gaps,
+    warn_of_names,
+    warn_of_times,
+)
 from trustbo.logs.poses import GAP, UNITS, poses_at, track_of
 from trustbo.workspace import Workspace
 
@@ -75,8 +81,8 @@ def read_tracks(
 
     Warns:
         UserWarning: A watcher is unknown, detections lie outside the time of the poses, their
-            interval is not the tick, a robot is never seen or never watches, or the lead leaves the
-            planned path.
+            interval is not the tick, poses are more than 5 s apart, a robot is never seen or never
+            watches, or the lead leaves the planned path.
 
     Example:
         >>> missions = tb.logs.read_tracks("poses.csv", "detections.csv", window=20.0)
@@ -127,6 +133,7 @@ def read_tracks(
 
     warn_of_names(looks, unknown, leads, team)
     warn_of_times(tracks, looks, tick)
+    warn_of_gaps(tracks, looks, pairs, leads)
     return missions
 
 
