@@ -194,9 +194,9 @@ def test_a_bag_may_lie_in_the_home_folder(driven, workspace, tmp_path, monkeypat
 ROBOTS = ("r1", "r2")
 
 
-def said(*statuses, hz=2.0, seconds=60.0):
+def said(*statuses, hz=2.0, seconds=60.0, version=2):
     """A log of three bounds of 20 s with contact all the time, and statuses (seconds, text)."""
-    log = Log()
+    log = Log(version)
     log.bound(1.0, 0, 2, 0)
     for k, cell in enumerate([(1, 0), (1, 1), (0, 2)], start=1):
         log.bound(20.0 * k - 18.0, k, *cell)
@@ -278,3 +278,16 @@ def test_a_bound_without_contact_messages_is_warned_of(workspace, tmp_path):
     with pytest.warns(UserWarning, match="no contact message.*bound 3 of mission 1"):
         (one,) = read_bag(path, workspace)
     assert np.isnan(one.contact_rate[2]).all()
+
+
+@pytest.mark.parametrize("kind", ["log.bag", "sqlite3"])
+def test_messages_that_are_in_two_parts_of_a_bag_count_once(kind, workspace, tmp_path):
+    whole = said((61.0, "ok"), version=1 if kind == "log.bag" else 2)
+    first, second = Log(whole.version), Log(whole.version)
+    first.messages, second.messages = whole.messages[:90], whole.messages[60:]
+    paths = [one.save(tmp_path / f"{i}-{kind}") for i, one in enumerate((first, second))]
+
+    (one,) = read_bag(whole.save(tmp_path / kind), workspace)
+    (other,) = read_bag(paths, workspace)
+    np.testing.assert_array_equal(one.n_ticks, other.n_ticks)
+    np.testing.assert_array_equal(one.contact_rate, other.contact_rate)

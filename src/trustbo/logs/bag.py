@@ -49,7 +49,7 @@ def read_bag(
 
     Args:
         path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2; a list of them is read as one
-            bag that was split.
+            bag that was split, whose parts may overlap.
         workspace: Workspace whose robots are read, in the order of its team.
         contact: Topic with the contact of a robot; its name replaces `{robot}`.
         prefix: Namespace of the topics of bounds and statuses, such as `"/fleet"` for
@@ -123,7 +123,7 @@ def _listed(paths: Sequence[Path]) -> str:
 def _messages(
     paths: Sequence[Path], bounds: str, statuses: str, contact: str, contacts: Sequence[str]
 ) -> pd.DataFrame:
-    """Read the topic and data of messages, indexed and sorted by recording time, ns.
+    """Read the topic and data of different messages, indexed and sorted by recording time, ns.
 
     Args:
         paths: Bags.
@@ -155,7 +155,10 @@ def _messages(
             f"{_listed(paths)} cannot be read as a ROS bag ({error or type(error).__name__}); give "
             "a complete .bag file of ROS 1, or the folder of a ROS 2 bag with its metadata.yaml."
         ) from None
-    return pd.DataFrame(messages, columns=["time", "topic", "data"]).set_index("time")
+
+    # Parts of a bag may overlap.
+    table = pd.DataFrame(messages, columns=["time", "topic", "data"]).drop_duplicates()
+    return table.set_index("time")
 
 
 def _data(reader: Any, connection: Any, raw: bytes, kinds: tuple[type, ...]) -> Any:
