@@ -419,3 +419,27 @@ def test_detections_that_gaps_of_poses_cost_are_warned_of(field, sparse):
 
     kept = (poses.robot != sparse) | (poses.t % 5.0 == 0.0)
     assert read_driven(field, poses[kept], seen).contact_rate.min() == 1.0
+
+
+@pytest.mark.parametrize("path", [None, [(3, 0), (3, 1), (3, 2), (3, 3)]])
+@pytest.mark.parametrize("edge", [0.0, 1.0])
+def test_inexact_positions_at_an_edge_do_not_begin_a_bound(field, edge, path):
+    """The lead waits 60 s, 1 m before the edge of its cell or on it, and drives on at 1 m/s."""
+    t = np.arange(0.0, 120.5, 0.5)
+    x = 19.0 + edge + np.maximum(t - 60.0, 0.0)
+    error = np.where((t < 60.0) & ((t + 5.0) % 9.0 < 2.0), 1.5, -0.1)
+    poses = pd.DataFrame({"t": t, "robot": "L", "x": x + error, "y": 10.0})
+    poses = pd.concat([poses.assign(x=x, robot=name) for name in NAMES] + [poses])
+    seen = [pd.DataFrame({"t": np.arange(60.5, 120.0), "watcher": name}) for name in NAMES]
+
+    one = read_driven(field, poses[poses.x < 79.0], pd.concat(seen).assign(seen="L"), path=path)
+    assert one.path == ((3, 0), (3, 1), (3, 2), (3, 3))
+    np.testing.assert_allclose(one.duration[:2], 20.0, atol=2.0)
+    assert one.contact_rate.min() == 1.0
+
+
+def test_short_visits_to_cells_that_the_lead_drives_through_are_bounds(field):
+    poses, seen = driven(field, PLANNED)
+    fast = [table.assign(t=table.t / 6.0) for table in (poses, seen)]  # 3.3 s in each cell
+    one = read_driven(field, *fast, tick=1.0 / 6.0)
+    assert (len(one.bounds), one.status) == (3, "ok")

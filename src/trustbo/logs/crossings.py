@@ -22,10 +22,14 @@ def crossings_of(
     grid: Grid,
     planned: Sequence[Cell] | None,
 ) -> tuple[Sequence[Cell], np.ndarray]:
-    """Return the path of the lead (by default, all cells that it enters) and its bounds' edges."""
+    """Return the path of the lead (by default, all cells that it enters) and its bounds' edges.
+
+    Entering and leaving follow one rule: a cell is left if the lead does not return within 5 s.
+    """
     located = zip(*grid.cells_at(places["x"].to_numpy(), places["y"].to_numpy()), strict=True)
     cells = [(int(row), int(col)) if is_on_grid else None for row, col, is_on_grid in located]
-    visits: list[tuple[int, Cell | None]] = list(zip(places["tick"], cells, strict=True))
+    ticks = places["tick"].tolist()
+    visits = [*zip(ticks, _without_excursions(ticks, cells, GAP / tick), strict=True)]
 
     entered = [(k, cell) for k, cell in visits if cell is not None]
     if not entered:
@@ -56,6 +60,31 @@ def crossings_of(
             "read as aborted there."
         )
     return path, np.array([*edges[1:], end])
+
+
+def _without_excursions(
+    ticks: Sequence[int], cells: Sequence[Cell | None], most: float
+) -> list[Cell | None]:
+    """Return the cell of the lead at each tick, in which it stays until it leaves for good.
+
+    A cell is left for good if the lead is elsewhere for more than `most` ticks. Shorter excursions
+    from which it returns are often errors of positions close to the edge of a cell.
+    """
+    steady = [*cells]
+    first = 0
+    while first < len(cells):
+        last = first  # index of the last tick in the cell
+        for i in range(first + 1, len(cells)):
+            if cells[i] == cells[first]:
+                last = i
+            elif ticks[i] - ticks[last + 1] > most:
+                break
+
+        if cells[first] is not None:
+            steady[first : last + 1] = [cells[first]] * (last + 1 - first)
+            first = last
+        first += 1
+    return steady
 
 
 def _require_route(

@@ -47,9 +47,10 @@ def read_tracks(
 
     With a workspace, the result is one mission for `Campaign.tell`, with the robots and features of
     the workspace and without measured awareness. A bound begins where the lead enters the next cell
-    of its path. If the planned path is given, a cell whose corner the lead only cuts does not count
-    as a bound. If the lead does not reach the last cell, the status is `"aborted"`. The last bound
-    ends where the lead leaves its cell for more than 5 s.
+    of its path. Excursions of at most 5 s, from which the lead returns to its cell, are ignored. If
+    the planned path is given, a cell whose corner the lead only cuts does not count as a bound. If
+    the lead does not reach the last cell, the status is `"aborted"`. The last bound ends where the
+    lead leaves its cell for more than 5 s.
 
     Without a workspace, bounds are time windows. The lead is also listed as a robot, with contact
     rates NaN and features 0. All missions therefore have the same robots. A bound without any tick
