@@ -156,8 +156,9 @@ def _messages(
             "a complete .bag file of ROS 1, or the folder of a ROS 2 bag with its metadata.yaml."
         ) from None
 
-    # Parts of a bag may overlap.
-    table = pd.DataFrame(messages, columns=["time", "topic", "data"]).drop_duplicates()
+    table = pd.DataFrame(messages, columns=["time", "topic", "data"])
+    if len(paths) > 1:  # parts of a bag may overlap
+        table = table.drop_duplicates()
     return table.set_index("time")
 
 
