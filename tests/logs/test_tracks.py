@@ -427,7 +427,7 @@ def test_inexact_positions_at_an_edge_do_not_begin_a_bound(field, edge, path):
     """The lead waits 60 s, 1 m before the edge of its cell or on it, and drives on at 1 m/s."""
     t = np.arange(0.0, 120.5, 0.5)
     x = 19.0 + edge + np.maximum(t - 60.0, 0.0)
-    error = np.where((t < 60.0) & ((t + 5.0) % 9.0 < 2.0), 1.5, -0.1)
+    error = np.where((t < 60.0) & ((t + 3.0) % 9.0 < 2.0), 1.5, -0.1)
     poses = pd.DataFrame({"t": t, "robot": "L", "x": x + error, "y": 10.0})
     poses = pd.concat([poses.assign(x=x, robot=name) for name in NAMES] + [poses])
     seen = [pd.DataFrame({"t": np.arange(60.5, 120.0), "watcher": name}) for name in NAMES]
