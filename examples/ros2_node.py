@@ -23,7 +23,8 @@ path first leads back to the previous cell; the way back is a bound with its own
 After each of these messages, the node publishes:
 
     /mission/trust    std_msgs/Float64MultiArray  trust in each robot: all means, then all sds
-    /mission/path     std_msgs/String             cells of the mission as JSON
+    /mission/path     std_msgs/String             cells of the whole mission as JSON, including
+                                                  those that were driven
 """
 
 import json

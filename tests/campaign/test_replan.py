@@ -70,7 +70,10 @@ def test_the_table_and_the_report_name_the_bound_that_failed_before_replanning()
 def test_a_mission_is_replanned_if_its_plan_contains_driven_or_blocked_bounds():
     campaign = begun()
     assert not is_replanned(campaign.ask())
-    assert is_replanned(campaign.replan(PATH[1]))
+    assert campaign.ask().n_driven == 0
+    plan = campaign.replan(PATH[1])
+    assert is_replanned(plan)
+    assert plan.n_driven == 1
 
     campaign = begun()
     assert is_replanned(campaign.replan(PATH[0], blocked=[PATH[:2]]))
@@ -235,6 +238,7 @@ def test_a_new_plan_survives_a_crash(tmp_path):
         asked = loaded.ask()
         assert asked.path == plan.path
         assert asked.blocked == plan.blocked
+        assert asked.n_driven == plan.n_driven == 3  # with the way back
         np.testing.assert_array_equal(asked.trust, plan.trust)
         rates = rates_of(len(plan.path) - 1)
         statuses = ["ok", "stuck", *["ok"] * (len(rates) - 2)]

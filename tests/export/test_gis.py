@@ -47,6 +47,17 @@ def test_places_in_geojson_are_those_of_the_plan(result, tmp_path):
     assert len(layers["routes"]) == sum(one is not None for bound in plan.routes for one in bound)
 
 
+def test_driven_bounds_are_marked_in_geojson(result, tmp_path):
+    write_geojson(tmp_path / "path.geojson", dataclasses.replace(result.plan, n_driven=1))
+    features = json.loads((tmp_path / "path.geojson").read_text())["features"]
+    about = [feature["properties"] for feature in features]
+    assert about[0]["n_driven"] == 1
+    for layer in ("bounds", "posts", "routes"):
+        of_layer = [one for one in about if one["layer"] == layer and one["bound"] > 0]
+        assert all(one["driven"] == (one["bound"] == 1) for one in of_layer)
+        assert len({one["driven"] for one in of_layer}) == 2
+
+
 @pytest.mark.parametrize("west", [-180.5, 179.5])
 def test_a_line_across_180_degrees_is_cut_there(west):
     cut = cut_at_180(shapely.LineString([(west, -17.0), (west + 1.0, -16.0)]))

@@ -182,6 +182,40 @@ def test_the_next_path_replaces_the_recommended_one_beside_the_map_of_the_prior(
         assert (tmp_path / name).read_bytes() == before[name]
 
 
+@pytest.mark.parametrize("is_stuck", [True, False])
+def test_waypoints_of_a_replanned_mission_are_those_still_ahead(is_stuck, tmp_path):
+    workspace = unequal_robots()
+    campaign = tb.Campaign(workspace, (2, 0), (0, 3))
+    path = [(2, 0), (2, 1), (2, 2), (1, 3), (0, 3)]
+    campaign.suggest(path)
+    write_nav2(tmp_path, campaign.ask())
+
+    n_run = 2 if is_stuck else 1
+    statuses = ["ok", "stuck"][:n_run]
+    unknown = np.full((n_run, 3, len(workspace.features)), np.nan)
+    so_far = tb.Mission.from_arrays(
+        path[: n_run + 1],
+        unknown,
+        np.ones((n_run, 3)),
+        status=statuses,
+        features=workspace.features,
+    )
+    plan = campaign.replan((2, 1), so_far)
+    ahead = plan.path[3:] if is_stuck else plan.path[1:]
+    assert ahead[0] == (2, 1)
+    write_nav2(tmp_path, plan)
+
+    # As for a fresh plan from the cell in which the team is.
+    fresh = campaign.planner.from_cell((2, 1)).evaluate(ahead, campaign.belief.mean())
+    frame = Frame(workspace.grid.center((2, 0)))
+    found = poses(tmp_path / "waypoints_lead.yaml")
+    np.testing.assert_allclose(found, frame.of_crs(fresh.stops), atol=1e-6)
+    for i, robot in enumerate(workspace.team.names):
+        found = poses(tmp_path / f"waypoints_{robot}.yaml")
+        assert len(found) == len(ahead)
+        np.testing.assert_allclose(found[:-1], frame.of_crs(fresh.posts[:, i]), atol=1e-6)
+
+
 def test_waypoints_in_another_frame_than_the_map_are_refused(result, tmp_path):
     write_nav2(tmp_path, result, frame=Frame(result.workspace.grid.center((2, 0)), 0.3))
     before = (tmp_path / "waypoints_lead.yaml").read_bytes()

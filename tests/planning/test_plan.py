@@ -50,6 +50,12 @@ def test_a_record_has_no_ways_and_the_plan_read_from_it_does(plan, workspace):
     assert_is_of_its_path(plan_from_record(record, workspace), workspace)
 
 
+def test_a_record_without_the_number_of_driven_bounds_is_of_a_whole_mission(plan, workspace):
+    record = plan_to_record(plan)
+    del record["n_driven"]
+    assert plan_from_record(record, workspace).n_driven == 0
+
+
 def test_plans_of_a_campaign_from_disk_have_them(workspace, tmp_path):
     ends = (2, 0), (0, 3)
     with tb.Campaign(

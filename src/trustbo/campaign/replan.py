@@ -162,6 +162,7 @@ def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:
         value_band=band,
         risk=risk,
         blocked=driven.blocked,
+        n_driven=n_driven,
     )
 
 
@@ -174,9 +175,5 @@ def _contact_lost(problem: Problem, driven: Driven) -> float:
 
 
 def is_replanned(plan: Plan) -> bool:
-    """Return whether bounds had been driven, or were blocked, when a campaign made this plan.
-
-    Only bounds that were driven have the failure probability 0; see `whole_plan`.
-    """
-    was_driven = plan.p_fail is not None and plan.p_fail[0] == 0.0
-    return was_driven or bool(plan.blocked)
+    """Return whether bounds had been driven, or were blocked, when a campaign made this plan."""
+    return plan.n_driven > 0 or bool(plan.blocked)

@@ -79,7 +79,9 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     The file contains a LineString of the path and a Point for each cell. The properties of a cell
     are the trust of each robot with its 90 % interval, and the failure probability. With a terrain,
     there is also a Point for each post and a LineString for each route. The property `layer` is
-    "path", "bounds", "posts" or "routes". Lines are cut where they cross the 180th meridian.
+    "path", "bounds", "posts" or "routes". Bounds, posts and routes have the property `driven`: true
+    if the bound had been driven when the mission was replanned. Lines are cut where they cross the
+    180th meridian.
 
     Args:
         path: File to write or replace.
@@ -96,7 +98,7 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     plan = plan.plan if isinstance(plan, Result) else plan
     require_kind("plan", plan, Plan, "give a Plan, for example from Campaign.ask, or a Result")
     centres = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
-    facts = {"name": name, "n_bounds": len(plan.path) - 1}
+    facts = {"name": name, "n_bounds": len(plan.path) - 1, "n_driven": plan.n_driven}
     facts |= {"value": float(plan.value), "objective": plan.objective}
     features = [_feature(plan, "path", centres, facts | {"length_m": float(plan.length)})]
     for about, place in zip(_cells(plan), centres, strict=True):
@@ -105,14 +107,14 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     team = plan.workspace.team
     for k, (cell, places) in enumerate(zip(plan.path, _of(plan.posts), strict=False), start=1):
         for robot, place in zip(team.names, places, strict=True):
-            features.append(
-                _feature(plan, "posts", place, {"bound": k, "robot": robot, "cell": [*cell]})
-            )
+            about = {"bound": k, "robot": robot, "driven": k <= plan.n_driven, "cell": [*cell]}
+            features.append(_feature(plan, "posts", place, about))
 
     for k, routes in enumerate(_of(plan.routes), start=1):
         for robot, route in zip(team.members, routes, strict=True):
             if route is not None:
-                about = {"bound": k, "robot": robot, "length_m": shapely.LineString(route).length}
+                about = {"bound": k, "robot": robot, "driven": k <= plan.n_driven}
+                about |= {"length_m": shapely.LineString(route).length}
                 features.append(_feature(plan, "routes", route, about))
 
     write_text(path, json.dumps({"type": "FeatureCollection", "features": features}))
@@ -176,7 +178,8 @@ def _cells(plan: Plan) -> list[dict[str, Any]]:
     for k, cell in enumerate(plan.path):
         values = {name: float(v[k - 1]) for name, v in columns.items() if k}
         known = {name: value for name, value in values.items() if value == value}
-        rows.append({"bound": k, **known, "cell": [*cell]})
+        driven = {"driven": k <= plan.n_driven} if k else {}
+        rows.append({"bound": k, **driven, **known, "cell": [*cell]})
     return rows
 
 

@@ -129,14 +129,16 @@ def write_nav2(
 
     For a plan, such as `campaign.ask()`, only its waypoints and the frame are written, because a
     plan has no costs of other bounds. A cost map and a route graph that are already in the folder
-    are kept.
+    are kept. The waypoints of a plan from `Campaign.replan` begin in the cell in which the
+    team is, `plan.path[plan.n_driven]`, and leave out the bounds that were driven.
 
     Args:
         folder: Folder for `cost_map.yaml` and `.pgm`, `waypoints_<robot>.yaml` (on a terrain),
             `route_graph.geojson` and `frame.yaml`.
         result: Result of a campaign, or the campaign; or a plan from `Campaign.ask`,
             `Campaign.replan` or `Follower.replan`.
-        frame: Frame of all files; by default, the centre of the first cell is the frame's origin.
+        frame: Frame of all files; by default, the frame's origin is the centre of the path's first
+            cell, where the mission starts.
         pixel: Side length of a map pixel, in metres; by default a tenth of a cell's shorter side.
 
     Raises:
@@ -318,27 +320,28 @@ def _require_near(frame: Frame, bounds: tuple[float, float, float, float]) -> No
 
 
 def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
-    """Return the poses (x, y, heading) of a robot's stops in a frame, shape (stop, 3).
+    """Return the poses (x, y, heading) of a robot's stops ahead in a frame, shape (stop, 3).
 
-    The lead faces its next stop. At each post, the other robots face the lead's next stop; at the
-    goal, they face the lead. Waypoints do not make robots wait for each other. Raises TrustboError
-    if there is no terrain or no route.
+    Stops of bounds that were driven are left out. The lead faces its next stop. At each post, the
+    other robots face the lead's next stop; at the goal, they face the lead. Waypoints do not make
+    robots wait for each other. Raises TrustboError if there is no terrain or no route.
     """
     require_choice("robot", robot, plan.workspace.team.members)
     if plan.stops is None or plan.posts is None or plan.routes is None:
         raise TrustboError(_NO_WAYPOINTS)
 
-    lead = frame.of_crs(plan.stops)
+    n = plan.n_driven
+    lead = frame.of_crs(plan.stops[n:])
     if robot == LEAD:
         steps = np.diff(lead, axis=0)
         return _towards(lead, np.vstack([steps, steps[-1:]]))
 
     i = plan.workspace.team.names.index(robot)
-    routes = [of_bound[i + 1] for of_bound in plan.routes]
+    routes = [of_bound[i + 1] for of_bound in plan.routes[n:]]
     if any(route is None for route in routes) or routes[-1] is None:
         raise TrustboError(f"robot {robot!r} has no route in a bound; plan another path.")
 
-    places = frame.of_crs(np.vstack([plan.posts[:, i], routes[-1][-1:]]))
+    places = frame.of_crs(np.vstack([plan.posts[n:, i], routes[-1][-1:]]))
     return _towards(places, np.vstack([lead[1:], lead[-1:]]) - places)
 
 

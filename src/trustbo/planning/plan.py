@@ -40,6 +40,9 @@ class Plan(Summary):
         infeasible: Whether the failure probability of the path exceeds `max_failure`.
         blocked: Pairs of cells between which the team cannot drive a bound in this mission; see
             `Campaign.replan`.
+        n_driven: Number of bounds of the path before `path[n_driven]`, the cell in which the team
+            was when the mission was replanned; otherwise 0. The way back after a bound that failed
+            counts as driven.
         value_band: Ends of the 90 % band of the value over the draws, computed with the mean
             failure probability; None with one draw. `value` may lie outside the band, because it
             limits trust to 1.
@@ -64,6 +67,7 @@ class Plan(Summary):
     infeasible: bool = False
     value_band: tuple[float, float] | None = None
     blocked: tuple[tuple[Cell, ...], ...] = ()
+    n_driven: int = 0
 
     def with_draws(self, given: Self) -> Self:
         """Return this plan with the bands of `given`, a plan for the same path and many draws."""
