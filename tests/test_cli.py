@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import rasterio
+from disks import full_disk
 from worlds import hillside
 
 import trustbo as tb
@@ -85,6 +86,16 @@ def test_info_describes_and_draws_the_grid(rasters, tmp_path, capsys):
     assert call("info", *files, "--shape", "3,3", "--out", picture) == 0
     assert "3 x 3" in capsys.readouterr().out
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_info_on_a_full_disk_leaves_the_figure_as_it_was(rasters, tmp_path, capsys):
+    picture = tmp_path / "grid.png"
+    picture.write_bytes(b"before")
+    files = rasters / "dem.tif", rasters / "dsm.tif"
+    with full_disk():
+        assert call("info", *files, "--shape", "3,3", "--out", picture) == 2
+    assert "grid.png" in capsys.readouterr().err
+    assert picture.read_bytes() == b"before"
 
 
 def test_info_refuses_an_unknown_format_of_the_figure(rasters, tmp_path, capsys):

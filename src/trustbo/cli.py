@@ -173,16 +173,20 @@ def info(args: argparse.Namespace) -> None:
     import matplotlib.pyplot as plt
 
     import trustbo as tb
+    from trustbo.files import write_file
 
     workspace = _workspace(args)
     print(workspace)
     print(_passable(workspace))
     plt.switch_backend("agg")
     tb.plots.grid_map(workspace)
+    picture = io.BytesIO()
     try:
-        plt.savefig(args.out, dpi=150)
+        plt.savefig(picture, format=args.out.suffix[1:] or "png", dpi=150)
     except ValueError as error:  # a format that Matplotlib does not know
         raise TrustboError(f"--out: {error}.") from None
+
+    write_file(args.out, picture.getvalue())
     print(f"the figure of the grid is in {args.out}")
 
 

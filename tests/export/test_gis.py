@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 import shapely
+from disks import full_disk
 from rasterio.warp import transform
 from worlds import unequal_robots
 
@@ -25,6 +26,16 @@ def test_bands_of_a_geotiff_are_the_maps_in_their_place(result, maps, tmp_path):
         np.testing.assert_allclose(raster.read(1), maps["trust_mean"], rtol=1e-6)
         for cell in ((0, 1), (2, 3)):
             assert raster.index(*result.workspace.grid.center(cell)) == cell
+
+
+@pytest.mark.parametrize("format_", [name for name, (file, _) in WRITERS.items() if "." in file])
+def test_a_full_disk_leaves_the_file_as_it_was(format_, result, tmp_path):
+    [file] = export_result(result, tmp_path, [format_])
+    before = file.read_bytes()
+    with full_disk(), pytest.raises(TrustboError, match=file.name):
+        export_result(result, tmp_path, [format_])
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]
 
 
 def test_places_in_geojson_are_those_of_the_plan(result, tmp_path):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
+from disks import full_disk
 from enumeration import every_path
 from worlds import contact_along, hillside, random_cells
 
@@ -90,6 +91,13 @@ def test_cached_truths_of_two_terrains_are_two(wooded, tmp_path):
             cached.bounds, Truth.from_simulator(simulator, n_replicates=1).bounds
         )
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_full_disk_leaves_no_damaged_table_in_the_cache(wooded, tmp_path):
+    simulator = KinematicSimulator(wooded.workspace)
+    with full_disk(), pytest.raises(TrustboError, match="truth"):
+        Truth.from_simulator(simulator, n_replicates=1, folder=tmp_path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_bounds_that_fail_say_so_and_keep_no_contact(wooded):

@@ -4,10 +4,10 @@ import json
 from typing import Any
 
 import numpy as np
-import rasterio
 import rioxarray  # noqa: F401  (registers the .rio accessor)
 import shapely
 import xarray as xr
+from rasterio.io import MemoryFile
 from shapely import affinity
 
 from trustbo.campaign.result import Result
@@ -59,15 +59,17 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
         "compress": "deflate",
     }  # fmt: skip
 
-    def write(file: Any) -> None:
-        with rasterio.open(file, "w", **profile) as raster:
+    # In memory, because rasterio raises no error if it closes a file on a full disk.
+    with MemoryFile() as memory:
+        with memory.open(**profile) as raster:
             for i, (name, values) in enumerate(maps.data_vars.items(), start=1):
                 raster.write(values.transpose("y", "x").values.astype(np.float32), i)
                 raster.set_band_description(i, str(name))
                 if "long_name" in values.attrs:
                     raster.update_tags(i, long_name=str(values.attrs["long_name"]))
+        content = memory.read()
 
-    write_file(target, write)
+    write_file(target, content)
 
 
 def write_geojson(path: FilePath, plan: Plan | Result) -> None:

@@ -213,7 +213,8 @@ def _cached(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset])
 
     file = to_path(folder) / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
     if not file.exists():
-        write_file(file, make().to_netcdf)
+        # In memory, because the netCDF library keeps a file open if the disk is full.
+        write_file(file, bytes(make().to_netcdf(engine="netcdf4")))
     return xr.load_dataset(file)
 
 
