@@ -250,6 +250,18 @@ def test_a_new_plan_survives_a_crash(tmp_path):
         assert loaded.risk.failures.sum() == 1
 
 
+def test_failures_of_the_mission_in_progress_influence_its_plan_so_no_warning_says_otherwise():
+    campaign = begun()
+    assert not campaign.risk.has_failures
+    plan = campaign.ask()
+    statuses = []
+    for _ in range(3):
+        statuses += ["ok", "stuck"]  # the first bound or the way back, and the next one
+        so_far = mission(plan.path, rates_of(len(statuses)), statuses)
+        plan = campaign.replan(PATH[1], so_far)
+    assert plan.p_arrive < 0.9
+
+
 def test_what_cannot_be_replanned_leaves_the_plan_as_it_was(tmp_path):
     campaign = begun(directory=tmp_path / "field")
     asked = campaign.ask()

@@ -441,7 +441,7 @@ class Campaign(Result):
             draws = driven.filter.resample()
             rest = self._choose(rng, draws, planner)
             rest = rest.with_draws(planner.evaluate(rest.path, draws))
-            return self._record(whole_plan(self._base.problem, driven, rest))
+            return self._record(whole_plan(self._base.problem, driven, rest), risk)
 
     def _with_bands(self, plan: Plan) -> Plan:
         """Add the posterior bands to a plan."""
@@ -449,10 +449,15 @@ class Campaign(Result):
 
     def _accept(self, plan: Plan) -> Plan:
         """Record a plan, with posterior bands, as the next one to run."""
-        return self._record(self._with_bands(plan))
+        return self._record(self._with_bands(plan), self.risk)
 
-    def _record(self, plan: Plan) -> Plan:
-        """Record a plan as the next one to run, and warn if it is not safe."""
+    def _record(self, plan: Plan, risk: BoundRisk) -> Plan:
+        """Record a plan as the next one to run, and warn if it is not safe.
+
+        Args:
+            plan: Plan to record.
+            risk: Failure probabilities that the plan was made with.
+        """
         with self._recorded():
             self.state.asked = plan
 
@@ -461,14 +466,14 @@ class Campaign(Result):
                 f"the plan arrives with probability {plan.p_arrive:.3g} only, and max_failure does "
                 "not allow this. Suggest a safer path, or increase max_failure."
             )
-        self._warn_of_risk(plan)
+        self._warn_of_risk(plan, risk)
         return plan
 
-    def _warn_of_risk(self, plan: Plan) -> None:
+    def _warn_of_risk(self, plan: Plan, risk: BoundRisk) -> None:
         """Warn, once per campaign, if failure is likely but does not influence the plans."""
         options = self.state.settings["planner"]
         is_limited = any(options.get(name) is not None for name in ("max_failure", "failure_cost"))
-        if self._has_warned_of_risk or is_limited or self.risk.has_failures:
+        if self._has_warned_of_risk or is_limited or risk.has_failures:
             return
         if plan.p_arrive is None or plan.p_arrive >= _LIKELY_ARRIVAL:
             return
