@@ -295,6 +295,9 @@ def _missions(result: Result) -> _Section:
         "objective",
         "n_bounds",
     )
+    has_unmeasured = bool((table["n_unmeasured"] > 0).any())
+    if has_unmeasured:
+        columns += ("n_unmeasured",)
     shown = table.loc[:, [name for name in columns if name in table]].rename_axis("mission")
     about = f"The objective is {result.settings['objective'].replace('_', ' ')}."
     if result.settings["objective"] == "lost_contact":
@@ -304,6 +307,8 @@ def _missions(result: Result) -> _Section:
     shown.columns = [str(name).replace("_", " ") for name in shown.columns]
 
     about += " The value predicted for the plan of a mission is based on all earlier missions."
+    if has_unmeasured:
+        about += " Bounds without a measured rate count as the mean of the mission's other bounds."
     if any(replanned):
         about += f" {_about_replanned(result)}"
     return _Section(

@@ -300,6 +300,31 @@ def test_bounds_that_were_not_run_lose_all_contact_whatever_path_a_mission_has(w
     assert lost[0] == lost[1] == pytest.approx(len(path) - 1 - told.contact_rate.mean(1).sum())
 
 
+def test_contact_lost_is_a_sum_over_bounds_even_if_rates_are_missing(workspace):
+    campaign = begin(workspace)
+    campaign.suggest(DIAGONAL)
+    y = np.array([[1.0, np.nan, np.nan], [0.4, 0.5, np.nan], [0.2, 0.3, 0.1]])
+    unknown = np.full((3, 3, 2), np.nan)
+    campaign.tell(Mission.from_arrays(DIAGONAL, unknown, y))
+
+    y[1] = np.nan  # counts as the mean of the others
+    campaign.suggest(DIAGONAL)
+    campaign.tell(Mission.from_arrays(DIAGONAL, unknown, y))
+
+    table = campaign.table()
+    assert table["contact_lost"].tolist() == pytest.approx([0.0 + 0.55 + 0.8, 1.5 * (0.0 + 0.8)])
+    assert table["n_unmeasured"].tolist() == [0, 1]
+
+
+def test_contact_lost_without_gaps_is_that_of_the_mean_rate_to_the_last_digit(workspace):
+    campaign = begin(workspace)
+    told = rates(workspace, campaign.ask().path)
+    campaign.tell(told)
+    n = len(told.bounds)
+    [lost] = campaign.table()["contact_lost"]
+    assert lost == n - n * float(np.nanmean(told.contact_rate))
+
+
 def test_a_failure_without_rates_counts_until_a_user_excludes_it(workspace):
     campaign = begin(workspace)
     told = rates(workspace, DIAGONAL, fail_at=2)

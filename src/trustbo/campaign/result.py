@@ -54,6 +54,7 @@ _FIRST_COLUMNS = (
     "contact_rate",
     "objective",
     "n_bounds",
+    "n_unmeasured",
     "path_changed",
     "path",
 )
@@ -347,9 +348,12 @@ class Result(Summary):
         - `contact_rate`: mean contact rate.
         - `objective`: value of the objective for the plan.
         - `n_bounds`: number of bounds run.
+        - `n_unmeasured`: number of bounds run in which no contact rate was measured.
         - `path_changed`: whether the plan differs from the previous one.
         - `path`: planned path as text, such as "9,0 8,1".
-        - `contact_lost`: contact lost, in bounds; bounds that were not run lose all contact.
+        - `contact_lost`: contact lost, in bounds: the sum over bounds of 1 minus the mean contact
+          rate of the measured robots. Bounds without any rate count as the mean of the mission's
+          measured bounds, and bounds that were not run lose all contact.
         - Diagnostics of the posterior; see `fit`.
         """
         entries = enumerate(self.state.entries, start=1)

@@ -229,11 +229,34 @@ class State:
             "objective": plan.value,
             "path_changed": plan.path != before.path,
             "contact_rate": contact,
-            "contact_lost": n_planned - len(mission.bounds) * contact,
+            "contact_lost": _contact_lost(rates, n_planned),
             "status": mission.status,
             "state": TOLD,
             "reason": "",
             "where": path_text(failed),
             "n_bounds": len(mission.bounds),
+            "n_unmeasured": int(np.isnan(rates).all(axis=1).sum()),
             "path": path_text(plan.path),
         }
+
+
+def _contact_lost(rates: np.ndarray, n_planned: int) -> float:
+    """Sum the contact lost over the bounds of a mission, in bounds; NaN without any rate.
+
+    In each bound, the contact is the mean of the measured robots. A bound without any rate counts
+    as the mean of the other bounds, and a bound that was not run loses all contact.
+
+    Args:
+        rates: Contact rates of the bounds that were run, shape (bound, robot); NaN if unknown.
+        n_planned: Number of bounds of the path.
+    """
+    is_measured = np.isfinite(rates).any(axis=1)
+    if not is_measured.any():
+        return np.nan
+
+    of_bound = np.nanmean(rates[is_measured], axis=1)
+    contact = np.full(len(rates), of_bound.mean())
+    contact[is_measured] = of_bound
+
+    filled = np.where(np.isnan(rates), contact[:, None], rates)
+    return n_planned - len(rates) * float(filled.mean())
