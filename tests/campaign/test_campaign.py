@@ -300,6 +300,21 @@ def test_bounds_that_were_not_run_lose_all_contact_whatever_path_a_mission_has(w
     assert lost[0] == lost[1] == pytest.approx(len(path) - 1 - told.contact_rate.mean(1).sum())
 
 
+def test_a_mission_that_arrived_ends_at_the_goal(workspace):
+    campaign = begin(workspace)
+    campaign.suggest(DIAGONAL)
+    unknown = np.full((2, 3, 2), np.nan)
+    short = Mission.from_arrays(DIAGONAL[:3], unknown, np.full((2, 3), 0.8))
+    with pytest.raises(tb.TrustboError, match="goal"):
+        campaign.tell(short)
+    assert not campaign.missions
+
+    campaign.tell(replace(short, status="aborted"))
+    campaign.suggest(DIAGONAL)
+    campaign.tell(replace(short, path=DIAGONAL, status="timeout"))
+    assert campaign.table()["contact_lost"].tolist() == pytest.approx([1.4, 1.4])
+
+
 def test_contact_lost_is_a_sum_over_bounds_even_if_rates_are_missing(workspace):
     campaign = begin(workspace)
     campaign.suggest(DIAGONAL)

@@ -506,8 +506,9 @@ class Campaign(Result):
 
         Raises:
             TrustboError: The robots or features differ from the workspace's; the path leaves the
-                grid, skips cells, or does not begin at the start of the plan; the mission was told
-                before; or it cannot be written. The mission is then not recorded.
+                grid, skips cells, or does not begin at the start of the plan; the status is "ok",
+                but the path does not end at the goal; the mission was told before; or it cannot be
+                written. The mission is then not recorded.
 
         Warns:
             UserWarning: The mission is recorded but excluded or not learned yet, or what was
@@ -527,6 +528,12 @@ class Campaign(Result):
                 raise TrustboError(
                     f"the mission starts in cell {mission.path[0]}; it must start in "
                     f"{plan.path[0]}."
+                )
+            if mission.status == "ok" and mission.path[-1] != plan.path[-1]:
+                raise TrustboError(
+                    f'the status "ok" means that the goal {plan.path[-1]} was reached, but the '
+                    f"mission ends in cell {mission.path[-1]}; give the planned cells up to the "
+                    'goal, and a status such as "aborted".'
                 )
 
             learned = as_learned(mission, self.workspace, self.state.settings["awareness"])
