@@ -110,9 +110,14 @@ def test_options_of_planner_and_fit_are_passed_on(workspace):
     assert (sizes["chain"], sizes["draw"]) == (1, 120)
     with pytest.raises(TypeError, match="drws"):
         begin(workspace, fit={"drws": 3})
-    for option in ("start", "earlier"):  # which the campaign sets itself
-        with pytest.raises(TypeError, match=option):
+    for option in ("sampler", "seed", "earlier"):  # arguments of the campaign
+        with pytest.raises(tb.TrustboError, match=f"{option}.*fit="):
             begin(workspace, fit={option: None})
+    with pytest.raises(tb.TrustboError, match=r"objective.*planner="):
+        begin(workspace, planner={"objective": "mean"})
+    for options in ({"fit": {"start": None}}, {"planner": {"family": "censored"}}):
+        with pytest.raises(tb.TrustboError, match="itself"):
+            begin(workspace, **options)
     with pytest.raises(TypeError, match="max_bound"):
         begin(workspace, planner={"max_bound": 3})
 
@@ -363,6 +368,10 @@ def test_bad_arguments_are_refused_at_once(workspace):
         ({"model": "pooled"}, "model"),
         ({"hazard": 0.1}, "hazard"),
         ({"seed": -1}, "seed"),
+        ({"fit": {"draws": -1}}, "draws"),
+        ({"fit": {"chains": "5"}}, "chains"),
+        ({"fit": {"warmup": 2.5}}, "warmup"),
+        ({"planner": {"max_failure": 2.0}}, "max_failure"),
     ):
         with pytest.raises(tb.TrustboError, match=said):
             begin(workspace, **options)

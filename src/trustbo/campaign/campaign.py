@@ -26,8 +26,8 @@ from trustbo.campaign.replan import follow, whole_plan
 from trustbo.campaign.result import Result, in_a_line
 from trustbo.campaign.settings import (
     name_of,
-    require_options,
     require_options_of_fit,
+    require_options_of_planner,
     to_arguments,
     to_settings,
 )
@@ -156,9 +156,8 @@ class Campaign(Result):
         require_choice("awareness", awareness, AWARENESS)
         hazard = Hazard() if hazard is None else hazard
         require_kind("hazard", hazard, Hazard, "give a trustbo.hazard.Hazard")
-        options = require_options("planner", planner)
-        fit_options = require_options("fit", fit)
-        require_options_of_fit(fit_options)
+        options = require_options_of_planner(planner)
+        fit_options = require_options_of_fit(fit)
         learner = learner_of(model, workspace)
         if sampler is None:
             sampler = learner.samplers[0]

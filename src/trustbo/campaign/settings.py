@@ -2,14 +2,14 @@
 
 import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from trustbo.errors import require_kind, require_whole
+from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.files import to_json, to_plain
 from trustbo.hazard import Hazard
-from trustbo.inference.fit import fit
+from trustbo.inference.fit import fit, require_numbers_of_draws
 from trustbo.inference.learner import Learner
 from trustbo.planning import Planner
 from trustbo.planning.policies import Policy
@@ -17,22 +17,59 @@ from trustbo.workspace import Workspace
 
 _UNCHANGED = ("objective", "sampler", "seed", "initial", "awareness", "planner", "fit")
 """Arguments of `Campaign` that are stored unchanged."""
+_OF_PLANNER = ("workspace", "start", "goal", "objective")
+"""Arguments of `Planner` that are also arguments of `Campaign`."""
+_SET_IN_PLANNER = ("family",)
+"""Arguments of `Planner` that a campaign sets itself."""
+_OF_FIT = ("model", "earlier", "sampler", "workspace", "seed", "progress")
+"""Arguments of `fit` that are also arguments of `Campaign`."""
+_SET_IN_FIT = ("missions", "latent", "start")
+"""Arguments of `fit` that a campaign sets itself."""
 _FIT = inspect.signature(fit)
 
 
-def require_options(what: str, options: Any) -> dict[str, Any]:
-    """Return options as a new dict; raises TrustboError if they are not a mapping or None."""
+def require_options_of_planner(options: Any) -> dict[str, Any]:
+    """Return options of `Planner`, as given to `Campaign`, in a new dict.
+
+    `Planner` checks the other names and the values.
+
+    Raises:
+        TrustboError: The options are not a dict, or one of them is given to or set by the campaign.
+    """
+    return _require_options("planner", options, _OF_PLANNER, _SET_IN_PLANNER)
+
+
+def require_options_of_fit(options: Any) -> dict[str, Any]:
+    """Return options of `fit`, as given to `Campaign`, in a new dict.
+
+    Raises:
+        TrustboError: The options are not a dict, one of them is given to or set by the campaign, or
+            a number of draws is not a whole number.
+        TypeError: `fit` has no such option.
+    """
+    given = _require_options("fit", options, _OF_FIT, _SET_IN_FIT)
+    bound = _FIT.bind(**dict.fromkeys((*_OF_FIT, *_SET_IN_FIT)), **given)
+    bound.apply_defaults()
+
+    whole = bound.arguments
+    require_numbers_of_draws(whole["draws"], whole["chains"], whole["warmup"])
+    return given
+
+
+def _require_options(
+    what: str, options: Any, own: Sequence[str], set_itself: Sequence[str]
+) -> dict[str, Any]:
+    """Return options as a new dict; raises TrustboError for names in `own` and `set_itself`."""
     if options is None:
         return {}
-    return dict(require_kind(what, options, Mapping, "give a dict of options"))
 
-
-def require_options_of_fit(options: Mapping[str, Any]) -> None:
-    """Raise TypeError for options that `fit` does not have, or that the campaign sets itself."""
-    own = dict.fromkeys(
-        ("model", "earlier", "sampler", "workspace", "seed", "progress", "latent", "start")
-    )
-    _FIT.bind([], **own, **options)
+    given = dict(require_kind(what, options, Mapping, "give a dict of options"))
+    for name in given:
+        if name in own:
+            raise TrustboError(f"{name} is an argument of Campaign, not of {what}=.")
+        if name in set_itself:
+            raise TrustboError(f"a campaign sets {name} itself; leave it out of {what}=.")
+    return given
 
 
 def to_settings(

@@ -146,10 +146,7 @@ def fit(
     if model is None:
         scale = missions[0].scale  # empty unless the missions are people's reports
         model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))
-    draws = require_count("draws", draws)
-    chains = require_count("chains", chains)
-    if warmup is not None:
-        warmup = require_count("warmup", warmup)
+    draws, chains, warmup = require_numbers_of_draws(draws, chains, warmup)
     seed = require_whole("seed", seed, 0)
     if all(np.isnan(mission.contact_rate).all() for mission in missions):
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
@@ -192,6 +189,15 @@ def fit(
         _label_earlier(tree, len(earlier), missions[0].robots[len(robots) :])
     tree.attrs["seconds"] = time.perf_counter() - started
     return tree
+
+
+def require_numbers_of_draws(
+    draws: int, chains: int, warmup: int | None
+) -> tuple[int, int, int | None]:
+    """Return these arguments of `fit` as ints; raises TrustboError unless each is at least 1."""
+    if warmup is not None:
+        warmup = require_count("warmup", warmup)
+    return require_count("draws", draws), require_count("chains", chains), warmup
 
 
 def require_poolable_with_model(
