@@ -163,6 +163,19 @@ def test_impossible_values_are_refused_before_anything_is_written(changed, flags
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (("--start", "9,0"), "start (9, 0)"),
+        (("--goal", "0,9"), "goal (0, 9)"),
+        (("--max-slope", "95"), "degrees; got '95'"),
+    ],
+)
+def test_errors_speak_of_the_flag_and_its_unit(changed, said, flags, tmp_path, capsys):
+    assert call(*flags, *changed, "--out", tmp_path / "out") == 2
+    assert said in capsys.readouterr().err
+
+
 def test_the_choices_of_flags_are_names_that_the_package_knows():
     assert set(POLICIES) == set(tb.planning.POLICIES)
     assert set(OBJECTIVES) == set(tb.planning.OBJECTIVES)

@@ -7,7 +7,7 @@ import argparse
 import io
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -126,7 +126,7 @@ def _add_workspace(add: Any) -> None:
     add("--robots", type=_count, default=3, metavar="N", help="overwatching robots (default 3)")
     add(
         "--max-slope",
-        type=float,
+        type=slope,
         default=45.0,
         metavar="DEG",
         help="slope limit (default 45); if in doubt, 2 to 3 degrees less than the robots withstand",
@@ -150,6 +150,14 @@ def shape(text: str) -> tuple[int, int]:
     """Parse two whole numbers, such as "10,12"."""
     rows, cols = map(int, text.split(","))
     return rows, cols
+
+
+def slope(text: str) -> float:
+    """Parse a slope limit in degrees, above 0 and below 90."""
+    degrees = float(text)
+    if not 0.0 < degrees < 90.0:
+        raise argparse.ArgumentTypeError(f"must be above 0 and below 90 degrees; got {text!r}")
+    return degrees
 
 
 def place(text: str) -> tuple[int, int] | dict[str, float]:
@@ -201,22 +209,30 @@ def run(args: argparse.Namespace) -> None:
         options = dict(tb.paper.CAMPAIGN)
     given = {"policy": args.policy, "objective": args.objective}
     options |= {name: value for name, value in given.items() if value is not None}
-    workspace = _workspace(args, args.start, args.goal, **features)
+    workspace = _workspace(args, {"start": args.start, "goal": args.goal}, **features)
     if not args.quiet:
         print(_passable(workspace))
     _run(args, workspace, start=args.start, goal=args.goal, **options, stop=_stop(args))
 
 
-def _workspace(args: argparse.Namespace, *ends: Any, **features: Any) -> "Workspace":
-    """Make the workspace from the flags of `_add_workspace`, after a check of the ends of paths."""
+def _workspace(
+    args: argparse.Namespace, ends: Mapping[str, Any] | None = None, **features: Any
+) -> "Workspace":
+    """Make the workspace from the flags of `_add_workspace`, after a check of the ends of paths.
+
+    Args:
+        args: Parsed flags.
+        ends: Start and goal of the paths by their names, if there are any.
+        features: Further arguments of `Workspace.from_terrain`.
+    """
     from math import radians
 
     import trustbo as tb
     from trustbo.workspace.grid import Grid
 
     terrain = tb.terrain.read_terrain(args.dem, args.dsm, resolution=args.resolution)
-    for end in ends:  # before the slow computation of awareness
-        Grid.over(terrain, args.shape).locate(end)
+    for name, end in (ends or {}).items():  # before the slow computation of awareness
+        Grid.over(terrain, args.shape).locate(end, name)
     robot = tb.Robot(max_slope=radians(args.max_slope))
     team = tb.Team(robots=(robot,) * args.robots, lead=robot)
     return tb.Workspace.from_terrain(terrain, args.shape, team, **features)
