@@ -9,7 +9,9 @@ import xarray as xr
 
 from trustbo.data import Bound, Mission
 from trustbo.errors import TrustboError
+from trustbo.models import Priors
 from trustbo.team import Robot, Team
+from trustbo.workspace import Workspace
 
 PATH = [(2, 0), (1, 1), (0, 2)]
 
@@ -257,6 +259,20 @@ def test_numbers_of_numpy_become_python_s():
     robot = Robot(speed=np.float32(1.5), acquire=np.int64(2))
     assert (type(robot.speed), type(robot.acquire)) == (float, int)
     assert robot == Robot(speed=1.5, acquire=2)
+
+
+def test_names_in_a_set_have_no_order():
+    z, rates = np.full((2, 2, 2), 0.5), np.ones((2, 2))
+    for make in (
+        lambda: Team(2, names={"kea", "tui"}),
+        lambda: Mission.from_arrays(PATH, z, rates, robots={"kea", "tui"}),
+        lambda: Mission.from_arrays(PATH, z, rates, features=frozenset({"a", "b"})),
+        lambda: Workspace.from_awareness(np.full((2, 3, 3, 2), 0.5), features={"a", "b"}),
+        lambda: Priors.from_features({"line_of_sight", "b"}),
+    ):
+        with pytest.raises(TrustboError, match="order"):
+            make()
+    assert Team(2, names={"kea": 1, "tui": 2}.keys()).names == ("kea", "tui")
 
 
 @pytest.mark.parametrize("names", [(1, 2, 3), (None, 1.5, "c"), "abc", ("lead", "b", "c")])

@@ -14,7 +14,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.errors import TrustboError, composed, one_line
+from trustbo.errors import TrustboError, composed, one_line, require_order
 
 _NUMERIC = "biufO"
 """Kinds of dtypes that may hold real numbers."""
@@ -170,8 +170,10 @@ def without_rounding(values: np.ndarray) -> np.ndarray:
 def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:
     """Return names as a tuple; raises TrustboError if one is not a string or is repeated.
 
-    If `n` is given, there must be none or `n` of them.
+    They must have an order, so a set is refused. If `n` is given, there must be none or `n` of
+    them.
     """
+    require_order(what, given)
     is_scalar = isinstance(given, str | bytes) or getattr(given, "ndim", 1) == 0
     listed = isinstance(given, Iterable) and not is_scalar
     names = tuple(given) if listed else ()

@@ -190,6 +190,13 @@ def require_list(what: str, value: Any, kind: Any = object, remedy: str = "") ->
     return [require_kind(f"{what}[{k}]", entry, kind, advice) for k, entry in enumerate(entries)]
 
 
+def require_order(what: str, value: Any) -> Any:
+    """Return `value` unless it is a set, whose order differs between runs of Python."""
+    if isinstance(value, set | frozenset):
+        raise TrustboError(f"{what} need an order; got the set {one_line(value)}; give a list.")
+    return value
+
+
 def require_tuple(what: str, value: Any, n: int) -> tuple[float, ...]:
     """Return n numbers as floats, such as a mean and an sd; raises TrustboError unless finite."""
     numbers = require_list(what, value, remedy=f"give {n} numbers")

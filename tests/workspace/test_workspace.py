@@ -100,6 +100,11 @@ def test_datasets_that_are_no_terrain_are_refused(terrain):
             Workspace.from_terrain(terrain, shape)
 
 
+def test_pixel_features_in_a_set_have_no_order(terrain):
+    with pytest.raises(TrustboError, match="order"):
+        Workspace.from_terrain(terrain, (2, 3), features={"ease": {"slope", "roughness"}})
+
+
 def test_a_workspace_of_arrays():
     awareness = np.full((2, 3, 4, 3), 0.5)
     awareness[:, 1, 2] = np.nan

@@ -18,6 +18,7 @@ from trustbo.errors import (
     require_choice,
     require_finite,
     require_list,
+    require_order,
     require_positive,
     see,
 )
@@ -116,7 +117,8 @@ class Priors(Summary):
             object.__setattr__(self, name, number)
 
         if self.features is not None:
-            features = require_list("Priors.features", self.features, str, "give a list of names")
+            features = require_order("Priors.features", self.features)
+            features = require_list("Priors.features", features, str, "give a list of names")
             object.__setattr__(self, "features", tuple(features))
             self.coefficients(len(features))
 
@@ -156,6 +158,7 @@ class Priors(Summary):
         0.5 predicts a rate of 0.5. If there is no such feature, `default` is returned, which is the
         same for all features.
         """
+        features = require_order("features", features)
         features = require_list("features", features, str, "give the names of the features")
         require_choice("family", family, FAMILIES)
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled, without_rounding
 from trustbo.data import is_line_of_sight
-from trustbo.errors import TrustboError, require_kind
+from trustbo.errors import TrustboError, require_kind, require_order
 from trustbo.team import Team
 from trustbo.terrain import FEATURES, CompositeIndex
 from trustbo.terrain.features import pixel_feature
@@ -81,6 +81,7 @@ def pixel_maps(
             continue
 
         names = require_kind(f"feature {name!r}", parts, Iterable, remedy)
+        names = require_order(f"the parts of feature {name!r}", names)
         values = {part: values_of(part) for part in names}
 
         index = CompositeIndex({part: FEATURES[part].sign for part in values}).fit(values)
