@@ -261,6 +261,18 @@ def test_numbers_of_numpy_become_python_s():
     assert robot == Robot(speed=1.5, acquire=2)
 
 
+@pytest.mark.parametrize("lead", ["boss", None, Robot])
+def test_the_lead_of_a_team_is_a_robot(lead):
+    with pytest.raises(TrustboError, match="lead"):
+        Team(2, lead=lead)
+
+
+@pytest.mark.parametrize("status", [None, 5, {"ok", "stuck"}, ["ok", None]])
+def test_statuses_are_one_text_or_a_list_of_texts(status):
+    with pytest.raises(TrustboError, match="status"):
+        Mission.from_arrays(PATH, np.full((2, 2, 2), 0.5), np.ones((2, 2)), status=status)
+
+
 def test_names_in_a_set_have_no_order():
     z, rates = np.full((2, 2, 2), 0.5), np.ones((2, 2))
     for make in (

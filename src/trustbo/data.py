@@ -18,6 +18,8 @@ from trustbo.errors import (
     require_choice,
     require_finite,
     require_kind,
+    require_list,
+    require_order,
     require_pair,
     require_whole,
 )
@@ -312,7 +314,11 @@ class Mission(Summary):
                 "Give None for a log without a map."
             )
 
-        statuses = [*["ok"] * (len(y) - 1), status] if isinstance(status, str) else [*status]
+        if isinstance(status, str):
+            statuses = [*["ok"] * (len(y) - 1), status]
+        else:
+            remedy = "give one text, or a list with one for each bound"
+            statuses = require_list("status", require_order("statuses", status), str, remedy)
         if len(statuses) != len(y):
             raise TrustboError(
                 f"status must be one text or {len(y)}, one for each bound; got {len(statuses)}."

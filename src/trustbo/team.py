@@ -90,8 +90,8 @@ class Team(Summary):
         names: Names of the members of T2; by default r1, r2, ...
 
     Raises:
-        TrustboError: There are no robots, or `names` does not hold one distinct name per robot
-            other than `"lead"`.
+        TrustboError: There are no robots, the lead is not a `Robot`, or `names` does not hold one
+            distinct name per robot other than `"lead"`.
 
     Example:
         >>> tb.Team(robots=(tb.Robot(lidar_range=60.0), tb.Robot()), names=("spot", "husky"))
@@ -103,6 +103,7 @@ class Team(Summary):
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        require_kind("Team.lead", self.lead, Robot, "give a Robot")
         remedy = "give a sequence of Robot, or n_robots= for identical robots"
         for robot in require_kind("Team.robots", self.robots, Sequence, remedy):
             require_kind("Team.robots", robot, Robot, remedy)

@@ -7,6 +7,7 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
+from trustbo.simulation import KinematicSimulator
 from trustbo.team import Robot, Team
 from trustbo.terrain import pixel_size, read_terrain, synthetic_terrain
 from trustbo.workspace import Workspace
@@ -98,6 +99,17 @@ def test_datasets_that_are_no_terrain_are_refused(terrain):
     for shape in (10, (3.0, 3.0), (3, 3, 3)):
         with pytest.raises(TrustboError, match="shape"):
             Workspace.from_terrain(terrain, shape)
+
+
+@pytest.mark.parametrize("sight", [0.3, 0, "clear"])
+def test_a_sight_that_is_no_model_of_sight_is_refused(sight, terrain):
+    workspace = Workspace.from_terrain(terrain, (2, 3))
+    for make in (
+        lambda: Workspace.from_terrain(terrain, (2, 3), sight=sight),
+        lambda: KinematicSimulator(workspace, sight=sight),
+    ):
+        with pytest.raises(TrustboError, match="sight"):
+            make()
 
 
 def test_pixel_features_in_a_set_have_no_order(terrain):

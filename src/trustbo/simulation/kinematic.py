@@ -90,7 +90,7 @@ class KinematicSimulator(DescribedSimulator):
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         self.workspace = workspace
         self.terrain = terrain
-        self.sight = sight or workspace.sight or Sight()
+        self.sight = Sight.of(workspace.sight if sight is None else sight)
         self.team = workspace.team if team is None else team
         if self.team.names != workspace.team.names:
             raise TrustboError(

@@ -3,10 +3,11 @@
 import math
 from dataclasses import dataclass
 from functools import cache
+from typing import Self
 
 import numpy as np
 
-from trustbo.errors import require_positive, require_share
+from trustbo.errors import require_kind, require_positive, require_share
 from trustbo.kernels import kernel, part
 from trustbo.parallel import plain
 from trustbo.team import Robot
@@ -54,6 +55,12 @@ class Sight:
 
         object.__setattr__(self, "extinction", extinction)
         object.__setattr__(self, "crown_base", crown_base)
+
+    @classmethod
+    def of(cls, sight: Self | None) -> Self:
+        """Return the model of sight, by default `Sight()`; raises TrustboError if not a Sight."""
+        remedy = "give workspace.Sight(extinction=..., crown_base=...)"
+        return cls() if sight is None else require_kind("sight", sight, Sight, remedy)
 
 
 def optics(watcher: Robot, watched: Robot) -> np.ndarray:

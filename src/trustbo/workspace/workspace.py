@@ -121,7 +121,7 @@ class Workspace(Summary):
         """
         terrain = require_terrain(terrain)
         team = Team.of(team)
-        sight = sight or Sight()
+        sight = Sight.of(sight)
         grid = Grid.over(terrain, shape)
 
         if features is None:
