@@ -16,6 +16,10 @@ from trustbo.statespace.form import coupled_robots, independent_robots
 from trustbo.statespace.matrices import apply, root
 
 
+class ParameterShapeError(TrustboError):
+    """Error for a parameter of `ContactRate` that has neither one value nor one of each robot."""
+
+
 class ContactRate(dist.Distribution):
     """Distribution of contact rates given the drift, with trust integrated out.
 
@@ -90,7 +94,8 @@ class ContactRate(dist.Distribution):
                 model with an offset cannot plan. For memory of deviations, pass all inputs as
                 `offset`, with a drift of zeros and x0_mean = 0.
             delta_s: Standard deviation of the noise s that all robots share, shape (), or None.
-            n_ticks: Number of ticks of each rate, in the shape of `drift`. If every measured rate
+            n_ticks: Number of ticks of each rate, in the shape of `drift`. A model function passes
+                its input `n_ticks`; other values are refused in fits. If every measured rate
                 has one, `log_prob` refers to the tick counts, like the log-likelihoods of `fit`;
                 otherwise, it is the log density of the rates.
 
@@ -250,7 +255,7 @@ def _checked(name: str, value: ArrayLike, n_robots: int, may_be_matrix: bool) ->
         shapes = f"() or ({n_robots},)"
         if may_be_matrix:
             shapes = f"(), ({n_robots},) or ({n_robots}, {n_robots})"
-        raise TrustboError(
+        raise ParameterShapeError(
             f"{name} must have the shape {shapes}, as the drift has {n_robots} robots; got "
             f"{array.shape}."
         )

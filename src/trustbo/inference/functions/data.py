@@ -21,6 +21,15 @@ _FEWEST_MISSIONS = 4
 """Missions are padded to a power of 2 that is at least this number."""
 _UNKNOWN = -1
 """Index of an unknown cell or move."""
+_IN_PADDING = {
+    "awareness": 0.0,
+    RATES: np.nan,
+    "n_ticks": 0.0,
+    "duration": 0.0,
+    "cell": _UNKNOWN,
+    "bound": _UNKNOWN,
+}
+"""Values of the inputs in the padding."""
 
 Data = Mapping[str, Any]
 """Inputs by name.
@@ -46,11 +55,6 @@ def data_of(
     False, all moves are -1, and paths may jump; otherwise, a jump raises a TrustboError.
     """
     n_missions, n_bounds = observations.contact_rate.shape[:2]
-    missing = (
-        (0, _power_of_two(n_missions) - n_missions),
-        (0, -n_bounds % _STEP_OF_BOUNDS),
-    )
-
     n_ticks = np.zeros(observations.contact_rate.shape)
     duration = np.zeros(observations.contact_rate.shape)
     bound = np.full((n_missions, n_bounds, 3), _UNKNOWN)
@@ -64,19 +68,27 @@ def data_of(
             if moves:
                 bound[j, driven] = bounds_along(path)
 
-    def padded(values: np.ndarray, fill: float) -> np.ndarray:
-        margin = [*missing, *[(0, 0)] * (values.ndim - 2)]
-        return np.pad(values, margin, constant_values=fill)
-
-    return {
-        "awareness": padded(observations.awareness, 0.0),
-        RATES: padded(observations.contact_rate, np.nan),
-        "n_ticks": padded(n_ticks, 0.0),
-        "duration": padded(duration, 0.0),
-        "cell": padded(bound[..., 1:], _UNKNOWN),
-        "bound": padded(bound, _UNKNOWN),
+    data = {
+        "awareness": observations.awareness,
+        RATES: observations.contact_rate,
+        "n_ticks": n_ticks,
+        "duration": duration,
+        "cell": bound[..., 1:],
+        "bound": bound,
         "features": tuple(missions[0].features),
     }
+    shape = _power_of_two(n_missions), n_bounds + -n_bounds % _STEP_OF_BOUNDS
+    return padded(data, shape)
+
+
+def padded(data: Data, shape: tuple[int, int]) -> dict[str, Any]:
+    """Return inputs with missions and bounds of the padding added, up to the shape."""
+    arrays = {}
+    for name, values in arrays_of(data).items():
+        missing = [(0, n - m) for n, m in zip(shape, values.shape[:2], strict=True)]
+        margin = [*missing, *[(0, 0)] * (values.ndim - 2)]
+        arrays[name] = np.pad(values, margin, constant_values=_IN_PADDING[name])
+    return {**data, **arrays}
 
 
 def data_of_bounds(

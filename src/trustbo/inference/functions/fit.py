@@ -14,6 +14,7 @@ from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, require_kind, warn
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, statistics_of
 from trustbo.inference.draws import joined_draws, names_in, require_same_order
+from trustbo.inference.functions.checks import require_fittable
 from trustbo.inference.functions.data import (
     RATES,
     Data,
@@ -102,6 +103,7 @@ def fit_function(
     sites = model.sites(data)
     if workspace is not None:
         require_plannable(model, workspace)
+    require_fittable(model, data, sites, [len(mission.bounds) for mission in missions])
 
     first = _start(model, sites, data, start, chains, seed)
     samples, verdict = _sampled(

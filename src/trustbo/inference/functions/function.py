@@ -68,6 +68,23 @@ class Found(NamedTuple):
     """Whether `log_likelihood` refers to tick counts if every rate has one."""
 
 
+class Probe(NamedTuple):
+    """Results of all sites of a function for one draw of its variables, for checks."""
+
+    space: StateSpace
+    inputs: Inputs
+    rates: Any
+    """Observed value of the site `contact_rate`, shape (mission, bound, robot)."""
+    n_ticks: Any
+    """Tick counts of its distribution, of the same shape; None if it has none."""
+    values: dict[str, Any]
+    """Latent variables."""
+    log_p: dict[str, Any]
+    """Log density of each sample site, in the shape of its plates."""
+    computed: dict[str, Any]
+    """Sites of `numpyro.deterministic`."""
+
+
 class FunctionModel:
     """A NumPyro function `model(awareness, contact_rate=None, ...)` as a trust model.
 
@@ -290,8 +307,8 @@ class FunctionModel:
         if isinstance(rates, ContactRate):
             raise TrustboError(
                 f"{where} has a ContactRate that was changed by expand, mask or to_event; give a "
-                "drift of the shape (mission, bound, robot), and NaN for rates that are to be left "
-                "out."
+                "drift of the shape (mission, bound, robot), and set rates that are to be left out "
+                "to NaN in the missions."
             )
         raise TrustboError(
             f"{where} has the distribution {type(rates).__name__}; it must be "
@@ -397,6 +414,26 @@ class FunctionModel:
             },
             log_likelihood=rates.log_prob(trace[RATES]["value"]),
             of_counts=jnp.asarray(rates.n_ticks is not None),
+        )
+
+    def probe(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> Probe:
+        """Run the function like `evaluate`, and return the results of all sites."""
+        trace = self._trace(values, key, data)
+        drawn = {name: site for name, site in trace.items() if site["type"] == "sample"}
+        log_p = {name: site["fn"].log_prob(site["value"]) for name, site in drawn.items()}
+        for name, site in drawn.items():
+            if site["scale"] is not None:
+                log_p[name] = site["scale"] * log_p[name]
+
+        rates: Any = trace[RATES]["fn"]
+        return Probe(
+            space=rates.space,
+            inputs=rates.inputs,
+            rates=trace[RATES]["value"],
+            n_ticks=rates.n_ticks,
+            values={name: trace[name]["value"] for name in latent_in(trace)},
+            log_p=log_p,
+            computed={n: s["value"] for n, s in trace.items() if s["type"] == "deterministic"},
         )
 
     def form(

@@ -1,0 +1,205 @@
+"""Checks of what a function computes from its data, for some draws from the prior.
+
+The padding adds missions and bounds without contact rates. They have no effect on the likelihood of
+the rates, but functions may use them elsewhere, for example in the mean of awareness or in a second
+likelihood. The function is therefore run on a part of the data that needs no padding, and on the
+same part with padding.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from trustbo.errors import TrustboError
+from trustbo.inference.functions.data import RATES, Data, arrays_of, padded
+from trustbo.inference.functions.function import FunctionModel, Probe
+from trustbo.inference.functions.sites import Site, doubled
+from trustbo.models.backend import own_settings
+from trustbo.models.contact_rate import ParameterShapeError
+
+_N_DRAWS = 4
+"""Number of draws from the prior for which the function is run."""
+_SEED = 20261127
+"""Seed for these draws."""
+_MISSIONS_PER_PART = 4
+"""Number of padded missions for each mission of the part; at least a quarter are not padding."""
+_SAME = 1e-5
+"""Largest relative difference of results that should be equal; functions may use 32 bits."""
+
+
+def require_fittable(
+    model: FunctionModel, data: Data, sites: Mapping[str, Site], n_bounds: Sequence[int]
+) -> None:
+    """Raise TrustboError if the posterior of a function would not be that of its data.
+
+    The padding may change nothing but the variables of single missions, and the parameters of the
+    site `contact_rate` must be those of robots.
+
+    Args:
+        model: The function.
+        data: Its inputs, padded unless it takes all data as one object.
+        sites: Its variables for these data.
+        n_bounds: Number of bounds of each mission.
+    """
+    if model.needs_observations:  # its data are not padded
+        _require_parameters_of_robots(model, data)
+    else:
+        _require_unpadded_results(model, data, sites, n_bounds)
+
+
+def _require_unpadded_results(
+    model: FunctionModel, data: Data, sites: Mapping[str, Site], n_bounds: Sequence[int]
+) -> None:
+    """Raise TrustboError if the padding changes the posterior."""
+    part = _part_of(data, n_bounds)
+    try:
+        sites_of_part = model.sites(part)
+        wanted: Probe = model.over_draws("probe", 2, part)({}, _keys())
+    except TrustboError as error:
+        _require_no_shape_error(model, error)
+        return
+
+    for name, site in sites.items():
+        own = sites_of_part.get(name)
+        if own is None or (site.mission_axis is None and site.shape != own.shape):
+            raise TrustboError(
+                f"the size of the variable {name!r} of {model.in_short()} depends on the number "
+                "of missions or bounds, which are padded; sample variables of single missions "
+                "within the plate of the site 'contact_rate', numpyro.plate(\"mission\", "
+                "len(awareness))."
+            )
+
+    values = {name: _extended(v, sites[name].shape) for name, v in wanted.values.items()}
+    with_padding = padded(part, np.shape(data[RATES])[:2])
+    found: Probe = model.over_draws("probe", 2, with_padding)(values, _keys())
+    _require_same_rates(model, wanted, found)
+    _require_same_densities(model, wanted, found, sites, sites_of_part)
+    _require_same_computed(model, wanted, found, list(model.computed_sites(data)))
+
+
+def _part_of(data: Data, n_bounds: Sequence[int]) -> dict[str, Any]:
+    """Return some of the longest missions, up to the last bound that all of them drove.
+
+    Their number depends only on that of the padded missions, which limits the number of compiled
+    shapes. There are fewer missions and bounds than in the padded data.
+    """
+    n_missions, n_padded = np.shape(data[RATES])[:2]
+    n_some = n_missions // _MISSIONS_PER_PART
+    some = np.sort(np.argsort(-np.asarray(n_bounds), kind="stable")[:n_some])
+    n_driven = max(1, min(min(n_bounds[j] for j in some), n_padded - 1))
+    return {**data, **{name: v[some, :n_driven] for name, v in arrays_of(data).items()}}
+
+
+def _keys() -> Any:
+    """Return the random keys of the draws."""
+    with own_settings():
+        return jax.random.split(jax.random.key(_SEED), _N_DRAWS)
+
+
+def _extended(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Extend values (draw, ...) to the shape of each draw, with values of another draw."""
+    missing = [(0, n - m) for n, m in zip(shape, values.shape[1:], strict=True)]
+    extended = np.pad(values[::-1], [(0, 0), *missing], mode="edge")
+    extended[tuple(slice(n) for n in values.shape)] = values
+    return extended
+
+
+def _is_same(wanted: np.ndarray, found: np.ndarray) -> bool:
+    """Return whether results without padding equal the first ones of the results with padding."""
+    if wanted.ndim != found.ndim:
+        return False
+
+    first = found[tuple(slice(n) for n in wanted.shape)]
+    if first.shape != wanted.shape:
+        return False
+    size = np.abs(wanted[np.isfinite(wanted)]).max(initial=0.0)
+    return np.allclose(first, wanted, rtol=_SAME, atol=_SAME * size, equal_nan=True)
+
+
+def _require_same_rates(model: FunctionModel, wanted: Probe, found: Probe) -> None:
+    """Raise TrustboError if the padding changes the distribution of the measured rates."""
+    fields = [(a, b) for a, b in zip(wanted.space, found.space, strict=True) if a is not None]
+    if not all(a.shape == b.shape and _is_same(a, b) for a, b in fields):
+        raise TrustboError(_not_of_robots(model))
+
+    for name in ("drift", "offset"):
+        if not _is_same(getattr(wanted.inputs, name), getattr(found.inputs, name)):
+            raise TrustboError(
+                f"the {name} of {model.in_short()} changes with the padding of missions and "
+                "bounds; instead of means, sums or numbers of missions and bounds, use constants, "
+                "for example from workspace.awareness."
+            )
+
+
+def _require_same_densities(
+    model: FunctionModel,
+    wanted: Probe,
+    found: Probe,
+    sites: Mapping[str, Site],
+    sites_of_part: Mapping[str, Site],
+) -> None:
+    """Raise TrustboError if the padding changes a prior or another likelihood."""
+    for name, log_p in found.log_p.items():
+        own = wanted.log_p.get(name)
+        if name in sites and sites[name].mission_axis is not None:
+            if _has_longer_events(name, found, sites, sites_of_part):
+                continue  # the density includes that of the padding
+        elif name != RATES and own is not None:
+            axes = tuple(range(1, log_p.ndim))
+            log_p = log_p.sum(axes)
+            own = own.sum(tuple(range(1, own.ndim)))
+
+        if own is None or not _is_same(own, log_p):
+            raise TrustboError(
+                f"the density of the site {name!r} of {model.in_short()} changes with the padding "
+                "of missions and bounds, which would change the posterior; leave out the padding, "
+                "which has no contact rates, for example with numpyro.handlers.mask(mask="
+                "jnp.isfinite(contact_rate).any((1, 2))) for a site with one value per mission."
+            )
+
+
+def _has_longer_events(
+    name: str, found: Probe, sites: Mapping[str, Site], sites_of_part: Mapping[str, Site]
+) -> bool:
+    """Return whether the padding adds entries to each event of a variable."""
+    n_batch = found.log_p[name].ndim - 1
+    return sites[name].shape[n_batch:] != sites_of_part[name].shape[n_batch:]
+
+
+def _require_same_computed(
+    model: FunctionModel, wanted: Probe, found: Probe, names: Sequence[str]
+) -> None:
+    """Raise TrustboError if the padding changes a site of `numpyro.deterministic`."""
+    for name in names:
+        if name not in wanted.computed or not _is_same(wanted.computed[name], found.computed[name]):
+            raise TrustboError(
+                f"the site {name!r} of {model.in_short()} changes with the padding of missions and "
+                "bounds; compute it from the draws of the posterior, or leave out the missions and "
+                "bounds whose contact rates are all NaN."
+            )
+
+
+def _require_parameters_of_robots(model: FunctionModel, data: Data) -> None:
+    """Raise TrustboError if a parameter of the rates has one value for each mission or bound."""
+    try:
+        for axis in (0, 1):
+            model.sites(doubled(data, axis))
+    except TrustboError as error:
+        _require_no_shape_error(model, error)
+
+
+def _require_no_shape_error(model: FunctionModel, error: TrustboError) -> None:
+    """Raise TrustboError if an error for fewer or more missions is one of a parameter's shape."""
+    if isinstance(error.__cause__, ParameterShapeError):
+        raise TrustboError(_not_of_robots(model)) from error
+
+
+def _not_of_robots(model: FunctionModel) -> str:
+    """Return a message that a parameter of the rates depends on missions or bounds."""
+    return (
+        f"beta0, a noise or the trust at the start in {model.in_short()} changes with the number "
+        "of missions or bounds; tb.models.ContactRate takes one value, or one of each robot, which "
+        "must depend on variables outside the plate of missions alone."
+    )

@@ -1,0 +1,200 @@
+"""Functions whose posterior would contain the padding, or whose rates are not the data."""
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from numpyro import handlers
+
+import trustbo as tb
+from trustbo.inference.functions.checks import require_fittable
+from trustbo.inference.functions.data import data_of
+from trustbo.inference.functions.function import as_model
+from trustbo.models import ContactRate
+from trustbo.models.observations import Observations
+
+
+def missions_of(n_missions, n_bounds=4, n_robots=3):
+    """Missions without tick counts, with bounds of 60 s."""
+    rng = np.random.default_rng(0)
+    made = []
+    for j in range(n_missions):
+        n = max(2, n_bounds - j)
+        z = rng.uniform(size=(n, n_robots, 1))
+        duration = np.full((n, n_robots), 60.0)
+        path = [(0, k) for k in range(n + 1)]
+        made.append(tb.Mission.from_arrays(path, z, 0.3 + 0.4 * z[..., 0], duration))
+    return made
+
+
+@pytest.fixture(scope="module")
+def missions():
+    return missions_of(3)
+
+
+def rates(drift, contact_rate, delta_v=0.1, **options):
+    with numpyro.plate("mission", len(drift)):
+        law = ContactRate(drift, 0.4, 0.05, delta_v, **options)
+        numpyro.sample("contact_rate", law, obs=contact_rate)
+
+
+def check(missions, model):
+    """Check a function as `tb.fit` does, without sampling."""
+    data = data_of(missions, Observations.from_missions(missions))
+    made = as_model(model)
+    n_bounds = [len(mission.bounds) for mission in missions]
+    require_fittable(made, data, made.sites(data), n_bounds)
+
+
+def with_times(awareness, contact_rate=None, duration=None):
+    mean = numpyro.sample("mean", dist.Normal(50.0, 50.0))
+    with numpyro.plate("mission", len(awareness)):
+        numpyro.sample("time", dist.Normal(mean, 10.0), obs=duration[:, 0, 0])
+    rates(0.3 * awareness[..., 0], contact_rate)
+
+
+def with_factor(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    drift = b + 0.3 * awareness[..., 0]
+    numpyro.factor("small", -(drift**2).sum())
+    rates(drift, contact_rate)
+
+
+def standardised(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    z = awareness[..., 0]
+    rates(b * (z - z.mean()) / z.std(), contact_rate)
+
+
+def above_the_least(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    z = awareness[..., 0]
+    rates(b * (z - z.min()), contact_rate)  # any padding makes it 0
+
+
+def by_progress(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    progress = jnp.linspace(0.0, 1.0, awareness.shape[1])[:, None]
+    rates(b * progress + 0.0 * awareness[..., 0], contact_rate)
+
+
+def with_mean_day(awareness, contact_rate=None):
+    with numpyro.plate("mission", len(awareness)):
+        z = numpyro.sample("z", dist.Normal())
+    numpyro.deterministic("mean_day", z.mean())
+    rates(0.1 * z[:, None, None] + 0.0 * awareness[..., 0], contact_rate)
+
+
+def with_common_prior(awareness, contact_rate=None):
+    with numpyro.plate("mission", len(awareness)):
+        z = numpyro.sample("z", dist.Normal(awareness.mean(), 0.1))
+    rates(z[:, None, None] + 0.0 * awareness[..., 0], contact_rate)
+
+
+def without_plate(awareness, contact_rate=None):
+    z = numpyro.sample("z", dist.Normal().expand([len(awareness)]).to_event(1))
+    rates(z[:, None, None] + 0.0 * awareness[..., 0], contact_rate)
+
+
+def with_rough_noise(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal())
+    rates(b + awareness[..., 0], contact_rate, delta_v=0.1 + awareness.mean())
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (with_times, "density of the site 'time'"),
+        (with_factor, "density of the site 'small'"),
+        (standardised, "the drift"),
+        (above_the_least, "the drift"),
+        (by_progress, "the drift"),
+        (with_mean_day, "the site 'mean_day'"),
+        (with_common_prior, "density of the site 'z'"),
+        (without_plate, "the variable 'z'"),
+        (with_rough_noise, "a noise"),
+    ],
+)
+@pytest.mark.parametrize("n", [1, 3])
+def test_the_padding_must_not_enter_the_posterior(n, function, message):
+    with pytest.raises(tb.TrustboError, match=message):
+        tb.fit(missions_of(n), function, draws=20, warmup=20, check=False, progress=False)
+
+
+def test_the_padding_must_not_enter_the_posterior_of_missions_that_need_none():
+    """Four missions of eight bounds have the padded shape, so five would have another posterior."""
+    with pytest.raises(tb.TrustboError, match="the drift"):
+        check([missions_of(1, n_bounds=8)[0]] * 4, standardised)
+
+
+def with_masked_times(awareness, contact_rate=None, duration=None):
+    """The mean duration of the measured bounds, as a second likelihood."""
+    is_measured = jnp.isfinite(contact_rate)
+    total = jnp.where(is_measured, duration, 0.0).sum((1, 2))
+    mean = numpyro.sample("mean", dist.Normal(50.0, 50.0))
+    with (
+        numpyro.plate("mission", len(awareness)),
+        handlers.mask(mask=is_measured.any((1, 2))),
+    ):
+        found = total / jnp.maximum(is_measured.sum((1, 2)), 1)
+        numpyro.sample("time", dist.Normal(mean, 10.0), obs=found)
+    rates(0.3 * awareness[..., 0], contact_rate)
+
+
+def with_masked_factor(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    drift = b + 0.3 * awareness[..., 0]
+    numpyro.factor("small", -jnp.where(jnp.isfinite(contact_rate), drift**2, 0.0).sum())
+    rates(drift, contact_rate)
+
+
+def with_outliers(awareness, contact_rate=None):
+    """A heavy-tailed variable of each bound."""
+    scale = numpyro.sample("scale", dist.HalfNormal(0.1))
+    with numpyro.plate("mission", len(awareness)):
+        jumps = dist.StudentT(4.0, 0.0, scale).expand(awareness.shape[1:3]).to_event(2)
+        jump = numpyro.sample("jump", jumps)
+    rates(jump + 0.3 * awareness[..., 0], contact_rate)
+
+
+def with_a_walk(awareness, contact_rate=None, duration=None):
+    """A random walk over missions, and a drift of the bounds so far and their durations."""
+    with numpyro.plate("mission", len(awareness)):
+        step = numpyro.sample("step", dist.Normal(0.0, 0.1))
+    level = numpyro.deterministic("level", jnp.cumsum(step))
+    drift = level[:, None, None] + jnp.cumsum(awareness[..., 0], axis=1) * duration / 60.0
+    numpyro.deterministic("drift", drift)
+    rates(drift, contact_rate)
+
+
+@pytest.mark.parametrize(
+    "function", [with_masked_times, with_masked_factor, with_outliers, with_a_walk]
+)
+def test_a_function_that_leaves_out_the_padding_is_accepted(missions, function):
+    check(missions, function)
+
+
+def with_noise_of_missions(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    with numpyro.plate("mission", len(awareness)):
+        noise = numpyro.sample("noise", dist.HalfNormal(0.1))
+    rates(b + awareness[..., 0], contact_rate, delta_v=noise)
+
+
+def with_noise_of_bounds(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    rates(b + awareness[..., 0], contact_rate, delta_v=0.1 * b**2 * jnp.ones(awareness.shape[1]))
+
+
+@pytest.mark.parametrize(
+    ("n_robots", "function", "message"),
+    [
+        (4, with_noise_of_missions, "a noise"),  # missions are padded to four
+        (8, with_noise_of_bounds, "a noise"),  # bounds are padded to eight
+    ],
+)
+def test_noises_must_be_those_of_robots(n_robots, function, message):
+    missions = missions_of(3, n_robots=n_robots)
+    with pytest.raises(tb.TrustboError, match=message):
+        tb.fit(missions, function, draws=20, warmup=20, check=False, progress=False)
