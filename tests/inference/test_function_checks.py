@@ -175,6 +175,21 @@ def test_a_function_that_leaves_out_the_padding_is_accepted(missions, function):
     check(missions, function)
 
 
+def with_constant_ticks(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    rates(b + awareness[..., 0], contact_rate, n_ticks=200.0)
+
+
+def with_halved_rates(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    rates(b + awareness[..., 0], None if contact_rate is None else 0.5 * contact_rate)
+
+
+def with_filled_rates(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    rates(b + awareness[..., 0], jnp.nan_to_num(contact_rate, nan=0.5))
+
+
 def with_noise_of_missions(awareness, contact_rate=None):
     b = numpyro.sample("b", dist.Normal(0.5, 0.3))
     with numpyro.plate("mission", len(awareness)):
@@ -190,11 +205,42 @@ def with_noise_of_bounds(awareness, contact_rate=None):
 @pytest.mark.parametrize(
     ("n_robots", "function", "message"),
     [
+        (3, with_constant_ticks, "n_ticks"),
+        (3, with_halved_rates, "obs=contact_rate"),
+        (3, with_filled_rates, "obs=contact_rate"),
         (4, with_noise_of_missions, "a noise"),  # missions are padded to four
         (8, with_noise_of_bounds, "a noise"),  # bounds are padded to eight
     ],
 )
-def test_noises_must_be_those_of_robots(n_robots, function, message):
+def test_rates_and_noises_must_be_those_of_the_data(n_robots, function, message):
     missions = missions_of(3, n_robots=n_robots)
     with pytest.raises(tb.TrustboError, match=message):
         tb.fit(missions, function, draws=20, warmup=20, check=False, progress=False)
+
+
+@pytest.mark.parametrize("n_ticks", [100.0, 200.0])
+def test_a_constant_number_of_ticks_must_be_that_of_the_missions(n_ticks):
+    counted = []
+    for one in missions_of(3):
+        shares = np.round(200.0 * one.contact_rate) / 200.0
+        ticks = np.full(shares.shape, 200.0)
+        counted.append(tb.Mission.from_arrays(one.path, one.awareness, shares, n_ticks=ticks))
+
+    def model(awareness, contact_rate=None):
+        b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+        rates(b + awareness[..., 0], contact_rate, n_ticks=n_ticks)
+
+    if n_ticks == 200.0:
+        check(counted, model)
+        return
+    with pytest.raises(tb.TrustboError, match="n_ticks"):
+        check(counted, model)
+
+
+def with_correlated_noise(awareness, contact_rate=None, n_ticks=None):
+    L = numpyro.sample("L", dist.LKJCholesky(3, 1.0))
+    rates(0.3 * awareness[..., 0], contact_rate, delta_v=0.01 * L @ L.T, n_ticks=n_ticks)
+
+
+def test_a_covariance_and_unknown_tick_counts_are_accepted(missions):
+    check(missions, with_correlated_noise)

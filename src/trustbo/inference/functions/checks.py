@@ -3,7 +3,7 @@
 The padding adds missions and bounds without contact rates. They have no effect on the likelihood of
 the rates, but functions may use them elsewhere, for example in the mean of awareness or in a second
 likelihood. The function is therefore run on a part of the data that needs no padding, and on the
-same part with padding.
+same part with padding. A third run, on the data, shows which rates and tick counts are observed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,8 +34,8 @@ def require_fittable(
 ) -> None:
     """Raise TrustboError if the posterior of a function would not be that of its data.
 
-    The padding may change nothing but the variables of single missions, and the parameters of the
-    site `contact_rate` must be those of robots.
+    The padding may change nothing but the variables of single missions. The site `contact_rate`
+    must observe the rates and tick counts of the data, and its parameters must be those of robots.
 
     Args:
         model: The function.
@@ -43,23 +43,33 @@ def require_fittable(
         sites: Its variables for these data.
         n_bounds: Number of bounds of each mission.
     """
+    values: dict[str, np.ndarray] = {}
     if model.needs_observations:  # its data are not padded
         _require_parameters_of_robots(model, data)
     else:
-        _require_unpadded_results(model, data, sites, n_bounds)
+        values = _require_unpadded_results(model, data, sites, n_bounds)
+
+    found: Probe = model.over_draws("probe", 2, data)(values, _keys())
+    _require_rates_of_data(model, data, found)
+    _require_ticks_of_data(model, data, found)
 
 
 def _require_unpadded_results(
     model: FunctionModel, data: Data, sites: Mapping[str, Site], n_bounds: Sequence[int]
-) -> None:
-    """Raise TrustboError if the padding changes the posterior."""
+) -> dict[str, np.ndarray]:
+    """Raise TrustboError if the padding changes the posterior.
+
+    Returns:
+        Draws of the variables from the prior, in the shape of the padded data. They are empty if
+        the function accepts no other number of missions or bounds than that of the data.
+    """
     part = _part_of(data, n_bounds)
     try:
         sites_of_part = model.sites(part)
         wanted: Probe = model.over_draws("probe", 2, part)({}, _keys())
     except TrustboError as error:
         _require_no_shape_error(model, error)
-        return
+        return {}
 
     for name, site in sites.items():
         own = sites_of_part.get(name)
@@ -74,9 +84,11 @@ def _require_unpadded_results(
     values = {name: _extended(v, sites[name].shape) for name, v in wanted.values.items()}
     with_padding = padded(part, np.shape(data[RATES])[:2])
     found: Probe = model.over_draws("probe", 2, with_padding)(values, _keys())
+    _require_rates_of_data(model, with_padding, found)
     _require_same_rates(model, wanted, found)
     _require_same_densities(model, wanted, found, sites, sites_of_part)
     _require_same_computed(model, wanted, found, list(model.computed_sites(data)))
+    return values
 
 
 def _part_of(data: Data, n_bounds: Sequence[int]) -> dict[str, Any]:
@@ -203,3 +215,28 @@ def _not_of_robots(model: FunctionModel) -> str:
         "of missions or bounds; tb.models.ContactRate takes one value, or one of each robot, which "
         "must depend on variables outside the plate of missions alone."
     )
+
+
+def _require_rates_of_data(model: FunctionModel, data: Data, found: Probe) -> None:
+    """Raise TrustboError unless the rates that are observed are those of the data."""
+    wanted = np.asarray(data[RATES])
+    if not all(np.allclose(y, wanted, rtol=_SAME, atol=0.0, equal_nan=True) for y in found.rates):
+        raise TrustboError(
+            f"the site 'contact_rate' of {model.in_short()} observes other values than the input "
+            "contact_rate; pass obs=contact_rate unchanged. To leave rates out, set them to NaN in "
+            "the missions."
+        )
+
+
+def _require_ticks_of_data(model: FunctionModel, data: Data, found: Probe) -> None:
+    """Raise TrustboError unless the tick counts are those of the data, or none."""
+    if found.n_ticks is None:
+        return
+
+    wanted, given = (np.where(n > 0.0, n, 0.0) for n in (data["n_ticks"], found.n_ticks))
+    is_measured = ~np.isnan(data[RATES])
+    if not np.allclose(given[:, is_measured], wanted[is_measured], rtol=_SAME):
+        raise TrustboError(
+            f"the n_ticks of ContactRate in {model.in_short()} differs from the tick counts of the "
+            "missions; pass the input n_ticks unchanged, or leave it out."
+        )
