@@ -202,6 +202,17 @@ def with_noise_of_bounds(awareness, contact_rate=None):
     rates(b + awareness[..., 0], contact_rate, delta_v=0.1 * b**2 * jnp.ones(awareness.shape[1]))
 
 
+def with_skew_noise(awareness, contact_rate=None):
+    b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+    skew = 0.01 * jnp.eye(3) + jnp.zeros((3, 3)).at[0, 1].set(0.005)
+    rates(b + awareness[..., 0], contact_rate, delta_v=skew)
+
+
+def with_factor_of_the_covariance(awareness, contact_rate=None):
+    L = numpyro.sample("L", dist.LKJCholesky(3, 1.0))
+    rates(0.3 * awareness[..., 0], contact_rate, delta_w=0.1 * L)
+
+
 @pytest.mark.parametrize(
     ("n_robots", "function", "message"),
     [
@@ -210,6 +221,8 @@ def with_noise_of_bounds(awareness, contact_rate=None):
         (3, with_filled_rates, "obs=contact_rate"),
         (4, with_noise_of_missions, "a noise"),  # missions are padded to four
         (8, with_noise_of_bounds, "a noise"),  # bounds are padded to eight
+        (3, with_skew_noise, "delta_v"),
+        (3, with_factor_of_the_covariance, "delta_w"),
     ],
 )
 def test_rates_and_noises_must_be_those_of_the_data(n_robots, function, message):

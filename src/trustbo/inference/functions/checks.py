@@ -52,6 +52,7 @@ def require_fittable(
     found: Probe = model.over_draws("probe", 2, data)(values, _keys())
     _require_rates_of_data(model, data, found)
     _require_ticks_of_data(model, data, found)
+    _require_symmetric(model, found)
 
 
 def _require_unpadded_results(
@@ -240,3 +241,14 @@ def _require_ticks_of_data(model: FunctionModel, data: Data, found: Probe) -> No
             f"the n_ticks of ContactRate in {model.in_short()} differs from the tick counts of the "
             "missions; pass the input n_ticks unchanged, or leave it out."
         )
+
+
+def _require_symmetric(model: FunctionModel, found: Probe) -> None:
+    """Raise TrustboError if a covariance matrix is not symmetric."""
+    matrices = {"delta_w": found.space.process_cov, "delta_v": found.space.shared_cov}
+    for name, matrix in matrices.items():
+        if matrix is not None and not _is_same(matrix, np.swapaxes(matrix, -1, -2)):
+            raise TrustboError(
+                f"the matrix {name} of ContactRate in {model.in_short()} is not symmetric; give a "
+                "covariance matrix, for example L @ L.T."
+            )
