@@ -33,9 +33,9 @@ def missions():
     return missions_of(3)
 
 
-def rates(drift, contact_rate, delta_v=0.1, **options):
+def rates(drift, contact_rate, delta_v=0.1, delta_w=0.05, **options):
     with numpyro.plate("mission", len(drift)):
-        law = ContactRate(drift, 0.4, 0.05, delta_v, **options)
+        law = ContactRate(drift, 0.4, delta_w, delta_v, **options)
         numpyro.sample("contact_rate", law, obs=contact_rate)
 
 
@@ -221,14 +221,24 @@ def with_factor_of_the_covariance(awareness, contact_rate=None):
         (3, with_filled_rates, "obs=contact_rate"),
         (4, with_noise_of_missions, "a noise"),  # missions are padded to four
         (8, with_noise_of_bounds, "a noise"),  # bounds are padded to eight
-        (3, with_skew_noise, "delta_v"),
-        (3, with_factor_of_the_covariance, "delta_w"),
+        (3, with_skew_noise, "matrix delta_v"),
+        (3, with_factor_of_the_covariance, "matrix delta_w"),
     ],
 )
 def test_rates_and_noises_must_be_those_of_the_data(n_robots, function, message):
     missions = missions_of(3, n_robots=n_robots)
     with pytest.raises(tb.TrustboError, match=message):
         tb.fit(missions, function, draws=20, warmup=20, check=False, progress=False)
+
+
+def test_noises_must_be_those_of_robots_if_data_are_not_padded():
+    """Three missions, given as one object, and three robots."""
+
+    def model(observations):
+        with_noise_of_missions(observations.awareness, observations.contact_rate)
+
+    with pytest.raises(tb.TrustboError, match="a noise"):
+        tb.fit(missions_of(3), model, draws=20, warmup=20, check=False, progress=False)
 
 
 @pytest.mark.parametrize("n_ticks", [100.0, 200.0])
