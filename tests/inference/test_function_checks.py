@@ -128,6 +128,14 @@ def test_the_padding_must_not_enter_the_posterior_of_missions_that_need_none():
         check([missions_of(1, n_bounds=8)[0]] * 4, standardised)
 
 
+def test_a_campaign_refuses_a_second_likelihood_of_the_padding_before_the_first_mission():
+    awareness = np.random.default_rng(0).uniform(size=(3, 3, 3, 1))
+    workspace = tb.Workspace.from_awareness(awareness)
+    with pytest.raises(tb.TrustboError, match="density of the site 'time'"):
+        tb.Campaign(workspace, (2, 0), (0, 2), model=with_times)
+    tb.Campaign(workspace, (2, 0), (0, 2), model=with_masked_times)
+
+
 def with_masked_times(awareness, contact_rate=None, duration=None):
     """The mean duration of the measured bounds, as a second likelihood."""
     is_measured = jnp.isfinite(contact_rate)

@@ -28,6 +28,7 @@ from trustbo.inference.functions.draws import FunctionDraws
 from trustbo.inference.functions.fit import (
     draws_of_function,
     prior_draws_of_function,
+    require_learnable,
     require_plannable,
     require_poolable_with_function,
     with_latent_of_function,
@@ -333,6 +334,7 @@ def learner_of(model: Model | FunctionModel | None, workspace: Workspace) -> Lea
         require_kind("model", model, TrustModel, remedy)
     function = as_model(model)
     require_plannable(function, workspace)
+    require_learnable(function, workspace)
     return FunctionLearner(function)
 
 

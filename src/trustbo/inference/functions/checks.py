@@ -47,7 +47,7 @@ def require_fittable(
     if model.needs_observations:  # its data are not padded
         _require_parameters_of_robots(model, data)
     else:
-        values = _require_unpadded_results(model, data, sites, n_bounds)
+        values = require_unpadded_results(model, data, sites, n_bounds)
 
     found: Probe = model.over_draws("probe", 2, data)(values, _keys())
     _require_rates_of_data(model, data, found)
@@ -55,7 +55,7 @@ def require_fittable(
     _require_symmetric(model, found)
 
 
-def _require_unpadded_results(
+def require_unpadded_results(
     model: FunctionModel, data: Data, sites: Mapping[str, Site], n_bounds: Sequence[int]
 ) -> dict[str, np.ndarray]:
     """Raise TrustboError if the padding changes the posterior.

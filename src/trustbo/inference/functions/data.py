@@ -21,6 +21,8 @@ _FEWEST_MISSIONS = 4
 """Missions are padded to a power of 2 that is at least this number."""
 _UNKNOWN = -1
 """Index of an unknown cell or move."""
+_IN_EXAMPLE = {RATES: 0.5, "n_ticks": 100.0, "duration": 60.0}
+"""Values of the measurements of an invented mission."""
 _IN_PADDING = {
     "awareness": 0.0,
     RATES: np.nan,
@@ -121,6 +123,21 @@ def data_of_bounds(
         "bound": indices,
         "features": tuple(features),
     }
+
+
+def data_of_example(
+    awareness: np.ndarray, bounds: np.ndarray, features: Sequence[str]
+) -> dict[str, Any]:
+    """Return the inputs of an invented mission with measurements in some bounds, padded.
+
+    For the arguments, see `data_of_bounds`.
+    """
+    data = data_of_bounds(awareness, bounds, features)
+    for name, value in _IN_EXAMPLE.items():
+        measured = np.full(data[name].shape, _IN_PADDING[name])
+        measured[:, : len(bounds)] = value
+        data[name] = measured
+    return padded(data, (_FEWEST_MISSIONS, data[RATES].shape[1]))
 
 
 def observations_of(data: Data) -> Observations:

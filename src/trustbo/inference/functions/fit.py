@@ -14,13 +14,14 @@ from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, require_kind, warn
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, statistics_of
 from trustbo.inference.draws import joined_draws, names_in, require_same_order
-from trustbo.inference.functions.checks import require_fittable
+from trustbo.inference.functions.checks import require_fittable, require_unpadded_results
 from trustbo.inference.functions.data import (
     RATES,
     Data,
     arrays_of,
     data_of,
     data_of_bounds,
+    data_of_example,
     observations_of,
 )
 from trustbo.inference.functions.draws import N_CHECKED, FunctionDraws
@@ -63,6 +64,8 @@ _ROUGH_RHAT = 1.1
 """Largest R-hat of the drift and the noises that the last check accepts, with a warning."""
 _ROUGH_ESS = 50.0
 """Smallest bulk ESS of the drift and the noises that the last check accepts."""
+_INVENTED = 4
+"""Number of bounds of an invented mission, with which a function is checked before missions."""
 _CHECKED = 100
 """Largest number of measured bounds whose drift is checked."""
 _MOST_ATTEMPTS = 10
@@ -342,6 +345,21 @@ def require_plannable(model: FunctionModel, workspace: Workspace) -> None:
     """Raise TrustboError if a function cannot plan in a workspace."""
     draws = prior_draws_of_function(model, N_CHECKED, 0, workspace)
     draws.require_plannable(workspace.awareness.values)
+
+
+def require_learnable(model: FunctionModel, workspace: Workspace) -> None:
+    """Raise TrustboError if the padding would change the posterior of a function.
+
+    Before there are missions, the check of `fit_function` is run on an invented mission.
+    """
+    if model.needs_observations:
+        return
+
+    awareness = workspace.awareness.values
+    z = np.moveaxis(awareness, 0, -2)  # (move, row, col, robot, feature)
+    known = np.argwhere(~np.isnan(z).any((-2, -1)))[:_INVENTED]
+    data = data_of_example(z[tuple(known.T)], known, workspace.features)
+    require_unpadded_results(model, data, model.sites(data), [len(known)])
 
 
 def require_poolable_with_function(
