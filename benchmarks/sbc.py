@@ -22,11 +22,11 @@ from scipy import stats
 from tqdm import tqdm
 
 import trustbo as tb
-from trustbo.inference.density import Density
+from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT
 from trustbo.inference.latent import replicate
-from trustbo.inference.variables import draw_prior, to_variables
+from trustbo.inference.variables import to_variables
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -97,7 +97,7 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
     )
     for j in range(n):
         rng = np.random.default_rng([seed, j])
-        truth = draw_prior(before, 1, rng)
+        truth = draw_prior(before, rng)
         rates = np.where(measured, replicate(before, truth, rng)[0], np.nan)
         posterior = Density(model, observations._replace(contact_rate=rates))
         drawn, _, summary = by_importance(posterior, n_ranked, int(rng.integers(2**31)))
@@ -105,6 +105,12 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
             found, true = (numbers(to_variables(posterior, d)) for d in (drawn, truth))
             ranks.append({name: int((found[name] < true[name][0]).sum()) for name in found})
     return pd.DataFrame(ranks), n - len(ranks)
+
+
+def draw_prior(density, rng):
+    """Draw the hyperparameters and coefficients once from the prior."""
+    theta = density.model.theta(density.scores.draw(1, rng), density.observations.resolution)
+    return JointDraws(theta, density.prior(theta).draw(rng))
 
 
 def numbers(groups):
