@@ -1,5 +1,6 @@
 """Files are written whole or not at all."""
 
+import os
 import signal
 import threading
 
@@ -9,23 +10,24 @@ from trustbo.errors import TrustboError
 from trustbo.files import hash_of, holding_interrupts, read_file, write_file
 
 
-def test_failed_write_leaves_the_file_before(tmp_path):
-    def fail(file):
-        file.write_text("half")
+def test_failed_write_leaves_the_file_before(tmp_path, monkeypatch):
+    def fail(descriptor):
         raise RuntimeError
 
-    write_file(tmp_path / "new" / "a.txt", lambda file: file.write_text("before"))
-    with pytest.raises(RuntimeError):
-        write_file(tmp_path / "new" / "a.txt", fail)
+    write_file(tmp_path / "new" / "a.txt", b"before")
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", fail)
+        with pytest.raises(RuntimeError):
+            write_file(tmp_path / "new" / "a.txt", b"half")
     assert (tmp_path / "new" / "a.txt").read_text() == "before"
-    write_file(tmp_path / "new" / "a.txt", lambda file: file.write_text("after"))
+    write_file(tmp_path / "new" / "a.txt", b"after")
     assert [file.read_text() for file in (tmp_path / "new").iterdir()] == ["after"]
 
 
 def test_refusal_of_the_system_names_the_file(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(TrustboError, match=r"a\.txt"):
-        write_file(tmp_path / "file" / "a.txt", lambda file: file.write_text("text"))
+        write_file(tmp_path / "file" / "a.txt", b"text")
 
 
 def test_missing_file_is_named(tmp_path):
@@ -33,18 +35,17 @@ def test_missing_file_is_named(tmp_path):
         read_file(tmp_path / "a.json")
 
 
-def test_two_threads_that_write_one_file_both_write_it_whole(tmp_path):
-    started, file = threading.Barrier(2), tmp_path / "a.txt"
+def test_two_threads_that_write_one_file_both_write_it_whole(tmp_path, monkeypatch):
+    written, file, fsync = threading.Barrier(2), tmp_path / "a.txt", os.fsync
+
+    def together(descriptor):
+        written.wait(timeout=30)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", together)
 
     def write(letter):
-        def halves(path):
-            with path.open("w") as stream:
-                stream.write(letter * 1000)
-                stream.flush()
-                started.wait()
-                stream.write(letter * 1000)
-
-        write_file(file, halves)
+        write_file(file, letter.encode() * 2000)
         assert set(file.read_text()) <= {"a", "b"}
 
     threads = [threading.Thread(target=write, args=(letter,)) for letter in "ab"]

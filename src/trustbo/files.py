@@ -7,7 +7,7 @@ import secrets
 import signal
 import stat
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from os import PathLike
@@ -44,10 +44,11 @@ def to_path(path: FilePath) -> Path:
         raise TrustboError(f"{text!r:.60}: the home folder of '~' is unknown.") from None
 
 
-def write_file(
-    path: FilePath, content: bytes | Callable[[Path], object], *, make_folder: bool = True
-) -> None:
+def write_file(path: FilePath, content: bytes, *, make_folder: bool = True) -> None:
     """Write a whole file or nothing.
+
+    The content is made in memory first: libraries that write to a path may hide that a disk is
+    full.
 
     The file is written under an unused temporary name in the same folder, flushed to disk and
     renamed. If anything fails, the temporary file is removed and an existing file is unchanged. A
@@ -55,7 +56,7 @@ def write_file(
 
     Args:
         path: File to write; `~` is the home folder.
-        content: Content of the file, or a function that writes it to a given path.
+        content: Content of the file.
         make_folder: Whether to create the folder if it does not exist.
 
     Raises:
@@ -73,17 +74,14 @@ def write_file(
         raise TrustboError(f"cannot write {str(given)!r}: {error.strerror or error}.") from error
 
 
-def _replace(target: Path, content: bytes | Callable[[Path], object]) -> None:
+def _replace(target: Path, content: bytes) -> None:
     """Write a temporary file, flush it to disk, and give it the name of the target."""
     temporary = target.with_name(f"{TEMPORARY}{secrets.token_hex(4)}{target.suffix}")
     # Unlike the modules of `tempfile`, this respects the umask.
     descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
     try:
         with os.fdopen(descriptor, "wb") as stream:
-            if isinstance(content, bytes):
-                stream.write(content)
-            else:
-                content(temporary)
+            stream.write(content)
 
         with temporary.open("rb+") as stream:
             os.fsync(stream.fileno())

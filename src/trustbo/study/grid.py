@@ -23,7 +23,7 @@ from trustbo.errors import (
     require_list,
     require_whole,
 )
-from trustbo.files import FilePath, to_path, write_file
+from trustbo.files import FilePath, to_path, write_text
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
 from trustbo.study.record import (
@@ -323,7 +323,7 @@ def _run(
 
         # The table is last, because a run counts as stored if its table exists.
         write_record(file, run._asdict(), known.sources, content)
-        write_file(file, lambda path: pd.DataFrame(rows).to_csv(path, index=False))
+        write_text(file, pd.DataFrame(rows).to_csv(index=False))
     except Exception as error:  # an error in one run does not stop the others
         return f"{', '.join(map(str, run))}: {type(error).__name__}: {error}"
     return ""
