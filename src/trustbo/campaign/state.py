@@ -258,5 +258,6 @@ def _contact_lost(rates: np.ndarray, n_planned: int) -> float:
     contact = np.full(len(rates), of_bound.mean())
     contact[is_measured] = of_bound
 
+    # One mean of all rates: missions without gaps keep their value to the last bit.
     filled = np.where(np.isnan(rates), contact[:, None], rates)
     return n_planned - len(rates) * float(filled.mean())
