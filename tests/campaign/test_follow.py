@@ -251,27 +251,30 @@ def example(name):
     return module
 
 
-def taking():
-    """The function of the example of a ROS node, for one mission."""
-    return partial(example("ros2_node").take, held=[])
+ROBOTS = ("r1", "r2", "r3")
+
+
+def ros_node(campaign=None):
+    """The function `take` of the example of a ROS node, for one mission, and its follower."""
+    follower = tb.Follower(begun(n_missions=0) if campaign is None else campaign)
+    return partial(example("ros2_node").take, follower, ROBOTS, held=[]), follower
 
 
 def test_the_example_of_a_ros_node_makes_the_mission_of_its_messages():
-    take, campaign = taking(), begun(n_missions=0)
-    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    take, follower = ros_node()
     seen, path = looks(len(follower.path) - 1), follower.path
-    t, over = 0.0, take(follower, robots, "bound", json.dumps({"bound": 0, "cell": path[0]}), 0.0)
+    t, over = 0.0, take("bound", json.dumps({"bound": 0, "cell": path[0]}), 0.0)
     for k, (cell, bound) in enumerate(zip(path[1:], seen, strict=True), start=1):
         assert not over
-        take(follower, robots, "bound", json.dumps({"bound": k, "cell": cell}), t)
+        take("bound", json.dumps({"bound": k, "cell": cell}), t)
         for tick in bound:
             t += TICK
-            for name, value in zip(robots, tick, strict=True):
+            for name, value in zip(ROBOTS, tick, strict=True):
                 if not np.isnan(value):
-                    take(follower, robots, name, bool(value), t)
+                    take(name, bool(value), t)
         if k != 2:  # the next bound ends the second one
-            over = take(follower, robots, "status", "ok", t)
-            take(follower, robots, "r1", True, t)  # counts for no bound
+            over = take("status", "ok", t)
+            take("r1", True, t)  # counts for no bound
     assert over
     found, expected = follower.to_mission(), whole(path, seen)
     for name in ("contact_rate", "n_ticks", "duration"):
@@ -279,11 +282,11 @@ def test_the_example_of_a_ros_node_makes_the_mission_of_its_messages():
 
 
 def test_the_example_of_a_ros_node_replans_after_a_bound_that_failed():
-    take, campaign = taking(), begun(n_missions=0)
-    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    campaign = begun(n_missions=0)
+    take, follower = ros_node(campaign)
     start, blocked, *_ = planned = follower.path
-    take(follower, robots, "bound", '{"bound": 1}', 0.0)
-    assert not take(follower, robots, "status", "stuck", 5.0)
+    take("bound", '{"bound": 1}', 0.0)
+    assert not take("status", "stuck", 5.0)
     assert follower.path[:3] == (start, blocked, start)
     assert follower.path[3] != blocked
     assert follower.path[-1] == planned[-1]
@@ -292,8 +295,8 @@ def test_the_example_of_a_ros_node_replans_after_a_bound_that_failed():
     t = 5.0
     for k in range(2, len(follower.path)):
         marker = {"bound": k, "cell": follower.path[k]}
-        take(follower, robots, "bound", json.dumps(marker), t)
-        over = take(follower, robots, "status", "ok", t := t + 5.0)
+        take("bound", json.dumps(marker), t)
+        over = take("status", "ok", t := t + 5.0)
     assert over
     mission = follower.to_mission()
     assert (mission.bounds[0].status, mission.status) == ("stuck", "ok")
@@ -301,21 +304,19 @@ def test_the_example_of_a_ros_node_replans_after_a_bound_that_failed():
 
 @pytest.mark.parametrize("status", ["tipped", "aborted"])
 def test_the_example_of_a_ros_node_ends_a_mission_that_cannot_go_on(status):
-    take, campaign = taking(), begun(n_missions=0)
-    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    take, follower = ros_node()
     path = follower.path
-    take(follower, robots, "bound", '{"bound": 1}', 0.0)
-    assert take(follower, robots, "status", status, 5.0)
+    take("bound", '{"bound": 1}', 0.0)
+    assert take("status", status, 5.0)
     assert follower.path == path
     assert follower.to_mission().status == status
 
 
 def test_the_example_of_a_ros_node_is_told_between_bounds_that_the_mission_ends():
-    take, campaign = taking(), begun(n_missions=0)
-    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
-    take(follower, robots, "bound", '{"bound": 1}', 0.0)
-    assert not take(follower, robots, "status", "stuck", 5.0)
-    assert take(follower, robots, "status", "aborted", 6.0)
+    take, follower = ros_node()
+    take("bound", '{"bound": 1}', 0.0)
+    assert not take("status", "stuck", 5.0)
+    assert take("status", "aborted", 6.0)
     assert follower.to_mission().status == "stuck"
 
 
@@ -323,40 +324,37 @@ def test_the_example_of_a_ros_node_ends_a_mission_whose_goal_cannot_be_reached(m
     def unreachable(self, *args, **options):
         raise tb.NoPathError("no path")
 
-    take, campaign = taking(), begun(n_missions=0)
-    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    take, _ = ros_node()
     monkeypatch.setattr(tb.Follower, "replan", unreachable)
-    take(follower, robots, "bound", '{"bound": 1}', 0.0)
-    assert take(follower, robots, "status", "stuck", 5.0)
+    take("bound", '{"bound": 1}', 0.0)
+    assert take("status", "stuck", 5.0)
 
 
 @pytest.mark.parametrize("status", ["ok", "stuck"])
 def test_the_example_of_a_ros_node_accepts_a_status_just_after_the_next_marker(status):
-    take, campaign = taking(), begun(n_missions=0)
-    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    take, follower = ros_node()
     path = follower.path
-    take(follower, robots, "bound", '{"bound": 1}', 0.0)
-    take(follower, robots, "r1", True, 1.0)
-    take(follower, robots, "bound", json.dumps({"bound": 2, "cell": path[2]}), 20.0)
-    take(follower, robots, "r1", True, 20.004)
-    assert not take(follower, robots, "status", status, 20.005)
+    take("bound", '{"bound": 1}', 0.0)
+    take("r1", True, 1.0)
+    take("bound", json.dumps({"bound": 2, "cell": path[2]}), 20.0)
+    take("r1", True, 20.004)
+    assert not take("status", status, 20.005)
 
     assert follower.running
     assert [(bound.status, bound.duration[0]) for bound in follower.bounds] == [(status, 20.0)]
-    take(follower, robots, "r1", False, 21.0)
-    take(follower, robots, "status", "ok", 40.0)
+    take("r1", False, 21.0)
+    take("status", "ok", 40.0)
     assert follower.bounds[1].contact_rate[0] == 0.5
     assert follower.bounds[1].duration[0] == 20.0
 
 
 def test_the_example_of_a_ros_node_leaves_later_statuses_to_the_new_bound():
-    take, campaign = taking(), begun(n_missions=0)
-    follower, robots = tb.Follower(campaign), ("r1", "r2", "r3")
+    take, follower = ros_node()
     for k, t in ((1, 0.0), (2, 20.0), (3, 40.0)):
-        take(follower, robots, "bound", json.dumps({"bound": k, "cell": follower.path[k]}), t)
-        take(follower, robots, "r1", True, t + 0.2)
-        take(follower, robots, "r1", True, t + 0.4)
-    take(follower, robots, "status", "stuck", 40.5)
+        take("bound", json.dumps({"bound": k, "cell": follower.path[k]}), t)
+        take("r1", True, t + 0.2)
+        take("r1", True, t + 0.4)
+    take("status", "stuck", 40.5)
     assert [bound.status for bound in follower.bounds] == ["ok", "ok", "stuck"]
     assert [bound.n_ticks[0] for bound in follower.bounds] == [2.0, 2.0, 2.0]
 
