@@ -24,6 +24,18 @@ def pytest_collection_modifyitems(items):
     items[:] = [*others[:half], *models, *others[half:]]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _scratch_folder(tmp_path_factory):
+    """Run the tests in a temporary folder, as faulty code may write to a relative path."""
+    if "TRUSTBO_DATA" in os.environ:
+        os.environ["TRUSTBO_DATA"] = str(Path(os.environ["TRUSTBO_DATA"]).absolute())
+
+    before = Path.cwd()
+    os.chdir(tmp_path_factory.mktemp("scratch"))
+    yield
+    os.chdir(before)
+
+
 @pytest.fixture(scope="session")
 def real_data():
     """The folder of real surveys (CONTRIBUTING says what is in it), without which tests skip."""
