@@ -3,7 +3,8 @@
 # make jupyter    install JupyterLab and open the notebooks
 # make notebooks  run the notebooks, with fewer missions than they show
 # make slow       run the tests that take long, which make test leaves out
-# make lint       format, style, types and the direction of imports
+# make lint       format, style, types, the direction of imports, and which files are tracked
+# make gate       list tables, figures and notebooks that this version may not reproduce
 # make docs       build the documentation site, and say where to open it
 # make bench      install the peers, and print the figures we claim beside theirs
 # make peers      ask pip whether the peers and JupyterLab can be installed, and install nothing
@@ -18,7 +19,7 @@ PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist
 # Where a container's shell says so, Python would compile all modules anew at each start, 7 s.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test jupyter notebooks slow lint docs bench peers clean
+.PHONY: demo test jupyter notebooks slow lint gate docs bench peers clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python scripts/demo.py --out out/demo
@@ -42,6 +43,12 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+	$(BIN)/python scripts/check_files.py
+
+# Both lists are of interest, also if the first one is not empty.
+gate: $(VENV)/.installed-dev
+	$(BIN)/python scripts/gate.py; stale=$$?; \
+		$(BIN)/python scripts/compare_notebooks.py && exit $$stale
 
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
