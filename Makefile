@@ -1,6 +1,6 @@
 # make demo       install into .venv and run a campaign on a real hillside, whose map is old
 # make test       install what the tests need too, and run them
-# make jupyter    install JupyterLab and open the notebooks
+# make jupyter    install JupyterLab and open copies of the notebooks, in out/notebooks
 # make notebooks  run the notebooks, with fewer missions than they show
 # make slow       run the tests that take long, which make test leaves out
 # make lint       format, style, types, the direction of imports, and which files are tracked
@@ -8,7 +8,7 @@
 # make docs       build the documentation site, and say where to open it
 # make bench      install the peers, and print the figures we claim beside theirs
 # make peers      ask pip whether the peers and JupyterLab can be installed, and install nothing
-# make clean      remove what make made, but not the campaigns in out/
+# make clean      remove what make made, but not the campaigns and notebooks in out/
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -29,11 +29,17 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-dev
 	XLA_FLAGS=--xla_backend_optimization_level=0 $(PYTEST) -m "not slow" tests
 
+# Copies, as JupyterLab saves what it runs, and notebooks write files beside themselves.
 jupyter: $(VENV)/.installed-notebook
-	$(BIN)/jupyter lab notebooks
+	mkdir -p out/notebooks
+	for file in notebooks/*.ipynb; do [ -e out/$$file ] || cp $$file out/$$file; done
+	$(BIN)/jupyter lab out/notebooks
 
 notebooks: $(VENV)/.installed-dev
-	TRUSTBO_FAST=1 $(PYTEST) --nbmake notebooks
+	rm -rf out/nbmake
+	mkdir -p out/nbmake
+	cp notebooks/*.ipynb out/nbmake
+	TRUSTBO_FAST=1 $(PYTEST) --nbmake out/nbmake
 
 slow: $(VENV)/.installed-dev
 	$(PYTEST) -m slow tests
@@ -61,9 +67,10 @@ peers: $(VENV)/.installed
 	$(PIP) --dry-run --editable ".[bench,notebook]"
 
 clean:
-	rm -rf $(VENV) .cache out/docs build dist .pytest_cache .ruff_cache .import_linter_cache
-	rm -rf __pycache__
-	find src tests benchmarks docs -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf $(VENV) .cache .hypothesis .pytest_cache .ruff_cache .import_linter_cache __pycache__
+	rm -rf build dist out/docs out/nbmake docs/_build docs/generated docs/notebooks notebooks/out
+	find src tests benchmarks docs examples notebooks scripts -type d \
+		\( -name __pycache__ -o -name .ipynb_checkpoints \) -prune -exec rm -rf {} +
 
 $(BIN)/python:
 	@python=$$(sh scripts/find_python.sh) && echo "creating $(VENV) with $$python" && \

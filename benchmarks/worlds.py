@@ -5,7 +5,7 @@
 
 The following smaller set of 17 worlds and 2 courses is used to evaluate changes of the defaults:
 
-    python benchmarks/worlds.py --set --out out/set --csv set.csv
+    python benchmarks/worlds.py --set --out out/set --csv out/set.csv
 
 By default, the benchmark runs all worlds, 4 courses and all methods, with 15 missions each. If you
 run it again, even with other options, existing results in --out are reused. The tables contain the

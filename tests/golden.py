@@ -2,8 +2,8 @@
 
 Run by hand, on one machine, before and after such a change:
 
-    python tests/golden.py write before.json [campaign ...]
-    python tests/golden.py compare before.json [campaign ...]
+    python tests/golden.py write out/before.json [campaign ...]
+    python tests/golden.py compare out/before.json [campaign ...]
 
 `compare` prints for each campaign whether all numbers are bit-identical, else the largest relative
 difference. `tests/test_golden.py` compares a few of the exact sampler, which take seconds, with
@@ -142,6 +142,7 @@ def main() -> None:
         file.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
         return
     if command == "write":
+        file.parent.mkdir(parents=True, exist_ok=True)
         found = {}
         for name in sys.argv[3:] or [*EXACT, *NUTS]:
             found[name] = record(name)

@@ -22,7 +22,7 @@ FOLDER = HERE / "generated" / "gallery"
 EXPLORER = "explore.html"
 _DPI = 110
 _NOTEBOOKS = (
-    "Jupyter notebooks with their outputs; `make jupyter` installs JupyterLab and opens them."
+    "Jupyter notebooks with their outputs; `make jupyter` installs JupyterLab and opens copies."
 )
 _PICTURES = {"compare_models": 3}
 """Index of the stored picture of a notebook that is shown; by default, the first one."""
