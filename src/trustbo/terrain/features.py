@@ -139,12 +139,28 @@ def _origin(function: Callable[..., Any]) -> tuple[object, ...]:
 def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
     """Return the nine heights of each pixel's 3 x 3 window, by step (down, right).
 
-    The ground is taken to be level beyond the edge of the raster.
+    Heights beyond the raster and missing heights are as in gdaldem with -compute_edges: beyond an
+    edge, the ground continues straight on; in the four corners, it does so to the north and south,
+    and is level to the east and west. A missing neighbour has the height of the pixel itself.
     """
-    wide = np.pad(z, 1, mode="edge")
+    across, along = ((0, 0), (1, 1)), ((1, 1), (0, 0))
+    inner = np.pad(_straight_on(z, across), along, mode="edge")
+    outer = _straight_on(np.pad(z, across, mode="edge"), along)  # for the first and the last row
+
     rows, cols = z.shape
-    steps = (-1, 0, 1)
-    return {(i, j): wide[1 + i :, 1 + j :][:rows, :cols] for i in steps for j in steps}
+    window = {}
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            there = slice(1 + down, 1 + down + rows), slice(1 + right, 1 + right + cols)
+            height = inner[there].copy()
+            height[[0, -1]] = outer[there][[0, -1]]
+            window[down, right] = np.where(np.isfinite(height), height, z)
+    return window
+
+
+def _straight_on(z: np.ndarray, width: Any) -> np.ndarray:
+    """Pad heights with twice the outermost minus the next one; a single one is repeated."""
+    return np.pad(z, width, mode="reflect", reflect_type="odd")
 
 
 def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
@@ -181,8 +197,8 @@ def slope(terrain: xr.Dataset) -> np.ndarray:
 @feature("roughness", sign=-1)
 def roughness(terrain: xr.Dataset) -> np.ndarray:
     """Compute the range of ground heights in the 3 x 3 window, m (Wilson et al. 2007)."""
-    window = np.stack(list(_window(terrain["dem"].values).values()))
-    return window.max(0) - window.min(0)
+    window = list(_window(terrain["dem"].values).values())
+    return np.maximum.reduce(window) - np.minimum.reduce(window)
 
 
 @feature("tri", sign=-1)
@@ -196,7 +212,7 @@ def tri(terrain: xr.Dataset) -> np.ndarray:
 def step_height(terrain: xr.Dataset) -> np.ndarray:
     """Compute the largest step to one of the 8 neighbours, m; missing neighbours are ignored."""
     z = terrain["dem"].values
-    return np.fmax.reduce([np.abs(w - z) for w in _window(z).values()])
+    return np.maximum.reduce([np.abs(w - z) for w in _window(z).values()])
 
 
 @feature("canopy_height", sign=-1)
