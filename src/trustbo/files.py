@@ -7,7 +7,7 @@ import secrets
 import signal
 import stat
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
 from os import PathLike
@@ -21,6 +21,11 @@ from trustbo.errors import TrustboError
 FilePath = str | PathLike[str]
 TEMPORARY = ".tmp-"
 """Beginning of the names of temporary files."""
+_SIDE_FILES = (
+    ".aux.xml", ".ovr", ".ovr.aux.xml", ".ovr.msk", ".msk", ".msk.aux.xml", ".msk.ovr",
+    ".vat.dbf", ".vat.cpg",
+)  # fmt: skip
+"""What GDAL and GIS append to the name of a raster to store its statistics, overviews and mask."""
 
 
 def to_path(path: FilePath) -> Path:
@@ -44,7 +49,9 @@ def to_path(path: FilePath) -> Path:
         raise TrustboError(f"{text!r:.60}: the home folder of '~' is unknown.") from None
 
 
-def write_file(path: FilePath, content: bytes, *, make_folder: bool = True) -> None:
+def write_file(
+    path: FilePath, content: bytes, *, make_folder: bool = True, is_raster: bool = False
+) -> None:
     """Write a whole file or nothing.
 
     The content is made in memory first: libraries that write to a path may hide that a disk is
@@ -54,10 +61,14 @@ def write_file(path: FilePath, content: bytes, *, make_folder: bool = True) -> N
     renamed. If anything fails, the temporary file is removed and an existing file is unchanged. A
     link is followed, and an existing file keeps its permissions.
 
+    Side files of a raster go before the new raster comes: if writing stops in between, the old
+    raster without its statistics is left, not the new one with those of the old one.
+
     Args:
         path: File to write; `~` is the home folder.
         content: Content of the file.
         make_folder: Whether to create the folder if it does not exist.
+        is_raster: Whether the file is a raster, whose old side files are removed, as GDAL does.
 
     Raises:
         TrustboError: The file cannot be written.
@@ -69,13 +80,15 @@ def write_file(path: FilePath, content: bytes, *, make_folder: bool = True) -> N
             raise TrustboError(f"cannot write {str(given)!r}: it is not a file.")
         if make_folder:
             target.parent.mkdir(parents=True, exist_ok=True)
-        _replace(target, content)
+        rasters = {given, target} if is_raster else set()  # GIS look beside a link, too
+        side_files = [Path(f"{raster}{ending}") for raster in rasters for ending in _SIDE_FILES]
+        _replace(target, content, side_files)
     except OSError as error:
         raise TrustboError(f"cannot write {str(given)!r}: {error.strerror or error}.") from error
 
 
-def _replace(target: Path, content: bytes) -> None:
-    """Write a temporary file, flush it to disk, and give it the name of the target."""
+def _replace(target: Path, content: bytes, side_files: Iterable[Path]) -> None:
+    """Write a temporary file, remove the side files, and rename the file to the target."""
     temporary = target.with_name(f"{TEMPORARY}{secrets.token_hex(4)}{target.suffix}")
     # Unlike the modules of `tempfile`, this respects the umask.
     descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
@@ -88,6 +101,8 @@ def _replace(target: Path, content: bytes) -> None:
 
         with suppress(OSError):
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
+        for file in side_files:
+            file.unlink(missing_ok=True)
         os.replace(temporary, target)
     except BaseException:
         with suppress(OSError):

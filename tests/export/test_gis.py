@@ -38,6 +38,59 @@ def test_a_full_disk_leaves_the_file_as_it_was(format_, result, tmp_path):
     assert list(tmp_path.iterdir()) == [file]
 
 
+def make_side_files(raster):
+    """Let GDAL store statistics, overviews, a mask and their statistics beside a raster."""
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=False, TIFF_USE_OVR=True):
+        with rasterio.open(raster, "r+") as opened:
+            if opened.driver == "GTiff":
+                opened.write_mask(np.ones(opened.shape, dtype=bool))
+            opened.build_overviews([2])
+
+        for name in (raster, *raster.parent.glob(f"{raster.name}.*")):
+            with rasterio.open(name) as opened:
+                opened.update_stats()
+
+
+@pytest.mark.parametrize("format_", ["geotiff", "nav2"])
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_a_raster_that_is_written_again_has_no_side_files_of_the_old_one(format_, result, tmp_path):
+    export_result(result, tmp_path, [format_])
+    before = set(tmp_path.rglob("*"))
+    [raster] = (file for file in before if file.suffix in (".tif", ".pgm"))
+    make_side_files(raster)
+    made = {file.name.removeprefix(raster.name) for file in set(tmp_path.rglob("*")) - before}
+    assert {".aux.xml", ".ovr", ".ovr.aux.xml"} <= made
+
+    raster.unlink()  # GDAL would leave the side files of a missing raster
+    export_result(result, tmp_path, [format_])
+    assert set(tmp_path.rglob("*")) == before
+
+    make_side_files(raster)
+    export_result(result, tmp_path, [format_])
+    assert set(tmp_path.rglob("*")) == before
+    with rasterio.open(raster) as opened:
+        assert len(opened.files) == 1
+
+
+def test_side_files_beside_a_link_to_a_raster_are_removed(maps, tmp_path):
+    raster, link = tmp_path / "maps_1.tif", tmp_path / "maps.tif"
+    write_geotiff(raster, maps)
+    link.symlink_to(raster)
+    for file in (raster, link):
+        make_side_files(file)
+    write_geotiff(link, maps)
+    assert sorted(tmp_path.iterdir()) == [link, raster]
+
+
+def test_a_full_disk_leaves_the_side_files(maps, tmp_path):
+    write_geotiff(tmp_path / "maps.tif", maps)
+    make_side_files(tmp_path / "maps.tif")
+    before = set(tmp_path.iterdir())
+    with full_disk(), pytest.raises(TrustboError, match=r"maps\.tif"):
+        write_geotiff(tmp_path / "maps.tif", maps)
+    assert set(tmp_path.iterdir()) == before
+
+
 def test_places_in_geojson_are_those_of_the_plan(result, tmp_path):
     write_geojson(tmp_path / "高度.geojson", result)
     features = json.loads((tmp_path / "高度.geojson").read_text("utf-8"))["features"]

@@ -27,7 +27,8 @@ _BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
 def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
     """Write maps of the planning cells as the bands of a GeoTIFF in the terrain's CRS.
 
-    Bands are float32 with nodata NaN, and their descriptions are the variable names.
+    Bands are float32 with nodata NaN, and their descriptions are the variable names. Files in which
+    a GIS stored statistics, overviews or masks of an older raster of that name are removed.
 
     Args:
         path: .tif or .tiff file to write or replace.
@@ -69,7 +70,7 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
                     raster.update_tags(i, long_name=str(values.attrs["long_name"]))
         content = memory.read()
 
-    write_file(target, content)
+    write_file(target, content, is_raster=True)
 
 
 def write_geojson(path: FilePath, plan: Plan | Result) -> None:

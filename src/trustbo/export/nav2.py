@@ -46,6 +46,8 @@ _MIN_COST = 1e-9
 """Minimum cost of an edge, since the route server rejects 0."""
 _FARTHEST = 10_000.0
 """Largest distance of a frame's origin from the map, in metres; float32 then resolves 1 mm."""
+_PICTURE = ".pgm"
+"""Suffix of the pixels of a cost map."""
 _NO_WAYPOINTS = "waypoints need a workspace made with Workspace.from_terrain."
 _DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)
 """Names that Windows reserves, with any suffix."""
@@ -237,7 +239,7 @@ def _require_file_names(robots: Sequence[str]) -> None:
 def _write(files: Mapping[Path, bytes]) -> None:
     """Write the contents of files, in order."""
     for path, content in files.items():
-        write_file(path, content)
+        write_file(path, content, is_raster=path.suffix == _PICTURE)
 
 
 def _ros_map(
@@ -245,7 +247,7 @@ def _ros_map(
 ) -> dict[Path, bytes]:
     """Return a cost map for the map_server of Nav2: a .yaml and a .pgm file with their contents."""
     values, corner, side = occupancy(cost.values, workspace, frame, pixel)
-    picture = target.with_suffix(".pgm")
+    picture = target.with_suffix(_PICTURE)
     # The first row of an image is in the north. In raw mode, map_server reads bytes as costs.
     pixels = f"P5\n{values.shape[1]} {values.shape[0]}\n255\n".encode() + values[::-1].tobytes()
 
