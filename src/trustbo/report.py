@@ -401,7 +401,7 @@ def _table(frame: pd.DataFrame) -> _Block:
 
 def _image(draw: Callable[[], Any], alt: str) -> _Block:
     """Draw a figure as an image with a text in its place."""
-    with drawing("default"):
+    with drawing(kept=()):
         figure = np.ravel(draw())[0].get_figure(root=True)
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=130, bbox_inches="tight")

@@ -9,6 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from cycler import cycler
+from matplotlib import patheffects
 
 import trustbo as tb
 from trustbo import plots
@@ -391,3 +393,98 @@ def test_the_report_has_contact_and_not_the_logit_of_it(result, tmp_path):
     assert found.plan.trust.max() > 1.0
     shown = float(re.search(r"Expected contact</th><td>([\d.]+)%", html)[1])
     assert shown == pytest.approx(100.0 * contact.mean(), abs=1.0)
+
+
+OTHER_SETTINGS = {
+    "image.origin": "lower",
+    "image.interpolation": "bicubic",
+    "image.interpolation_stage": "rgba",
+    "image.aspect": "auto",
+    "image.cmap": "gray_r",
+    "image.resample": False,
+    "axes.prop_cycle": cycler(linestyle=["none", ":"], marker=["x", "s"], alpha=[0.1, 0.2]),
+    "axes.xmargin": -0.3,
+    "axes.ymargin": -0.3,
+    "axes.axisbelow": False,
+    "axes.spines.left": False,
+    "axes.spines.bottom": False,
+    "axes.formatter.useoffset": True,
+    "axes.formatter.limits": [-1, 1],
+    "lines.linestyle": "none",
+    "lines.marker": "o",
+    "lines.markersize": 40.0,
+    "lines.linewidth": 0.0,
+    "lines.markeredgewidth": 20.0,
+    "scatter.marker": "x",
+    "scatter.edgecolors": "red",
+    "patch.linewidth": 30.0,
+    "patch.facecolor": "red",
+    "patch.force_edgecolor": True,
+    "hatch.color": "red",
+    "hatch.linewidth": 20.0,
+    "errorbar.capsize": 30.0,
+    "boxplot.notch": True,
+    "contour.corner_mask": False,
+    "contour.linewidth": 20.0,
+    "contour.algorithm": "threaded",
+    "pcolor.shading": "gouraud",
+    "pcolormesh.snap": False,
+    "text.usetex": True,
+    "text.parse_math": False,
+    "figure.autolayout": True,
+    "figure.constrained_layout.use": False,
+    "figure.subplot.left": 0.6,
+    "legend.numpoints": 5,
+    "legend.markerscale": 0.0,
+    "legend.loc": "center",
+    "path.simplify_threshold": 1.0,
+    "path.sketch": (30.0, 100.0, 2.0),
+    "path.effects": [patheffects.Normal(), patheffects.withStroke(linewidth=20, foreground="w")],
+    "xaxis.labellocation": "left",
+    "xtick.bottom": False,
+    "xtick.labelbottom": False,
+    "xtick.direction": "in",
+    "xtick.minor.visible": True,
+    "ytick.labelleft": False,
+    "ytick.labelright": True,
+}
+"""Settings of Matplotlib that change or hide what a figure says."""
+
+
+def pixels_of(figure):
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_settings_of_the_user_do_not_change_what_a_figure_says(name, result):
+    draw, _ = FIGURES[name]
+    expected = pixels_of(np.ravel(draw(result, None))[0].figure)
+    with mpl.rc_context(OTHER_SETTINGS):
+        found = pixels_of(np.ravel(draw(result, None))[0].figure)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_lines_on_the_user_s_axes_are_lines(result):
+    with mpl.rc_context(OTHER_SETTINGS):
+        [panel] = np.ravel(result.plot_history(ax=plt.subplots()[1]))
+    assert panel.lines[0].get_linestyle() == "-"
+    assert panel.lines[0].get_marker() == "None"
+
+
+@pytest.mark.parametrize("style", ["default", *plt.style.available])
+def test_the_colour_of_a_cell_is_that_of_its_value_in_every_style(style):
+    values = np.linspace(0.0, 1.0, 12).reshape(4, 3)
+    workspace = tb.Workspace.from_awareness(np.full((1, 4, 3, 1), 0.5), cell_size=10.0)
+    trust = xr.DataArray(values, dims=("row", "col"))
+    with plt.style.context(style):
+        panel = plots.cell_map(trust, workspace, limits=(0.0, 1.0), cmap="viridis")
+        drawn = pixels_of(panel.figure)
+
+    for cell in np.ndindex(4, 3):
+        place = np.array(workspace.grid.center(cell)) - workspace.grid.corner + 2.0  # off the bar
+        x, y = panel.transData.transform(place)
+        colour = drawn[len(drawn) - 1 - round(y), round(x)]
+        np.testing.assert_allclose(
+            colour, mpl.colormaps["viridis"](values[cell], bytes=True), atol=1
+        )

@@ -343,6 +343,7 @@ def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
     for panel in axes:
         panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
         panel.spines[:].set_visible(True)
+        panel.grid(visible=False)  # its lines would look like edges of cells
         panel.locator_params(nbins=4)
         panel.set(xlabel="east (m)", ylabel="north (m)")
         if panel.get_subplotspec() is not None:
@@ -435,6 +436,7 @@ def draw_ground(ax: Axes, workspace: Workspace) -> None:
     extent = extent_of(workspace.grid)
     ax.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", xticks=[], yticks=[])
     ax.spines[:].set_visible(True)
+    ax.grid(visible=False)  # its lines would look like edges of cells
     if terrain is None:
         draw_cell_edges(ax, workspace.grid)
         return

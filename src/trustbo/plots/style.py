@@ -31,8 +31,19 @@ RC: dict[str, Any] = {
     "image.cmap": "viridis",
     "image.interpolation": "nearest",
 }
-"""Matplotlib settings of all figures; the user's fonts, resolution, text colour and background
-colour are kept."""
+"""Matplotlib settings of all figures, besides Matplotlib's defaults and `KEPT`."""
+KEPT = (
+    "font.", "mathtext.", "figure.dpi", "figure.facecolor", "figure.edgecolor", "text.color",
+    "axes.facecolor", "axes.edgecolor", "axes.labelcolor", "axes.titlecolor", "axes.labelweight",
+    "axes.titleweight", "axes.grid", "axes.formatter.use_locale", "grid.", "xtick.color",
+    "xtick.labelcolor", "ytick.color", "ytick.labelcolor", "legend.labelcolor",
+)  # fmt: skip
+"""Beginnings of the Matplotlib settings that are the user's.
+
+These are fonts, the resolution, colours of text and background, and the grid. Other settings may
+change what a figure says, as `image.origin` and `lines.linestyle` do, or crop it, as `axes.xmargin`
+does.
+"""
 ROBOTS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 """Colours of the robots, from the palette of Okabe and Ito (2008)."""
 MARKERS = "osD^vPX*<>"
@@ -58,20 +69,25 @@ _WIDE = 5.0
 
 
 @contextmanager
-def drawing(style: Any) -> Iterator[None]:
-    """Draw with a Matplotlib style, and restore the user's settings afterwards.
+def drawing(kept: tuple[str, ...] = KEPT) -> Iterator[None]:
+    """Draw with Matplotlib's defaults, the user's settings of some names, and `RC`.
 
-    Matplotlib loads its backend with the first figure. In notebooks, the backend then turns on a
-    setting for displaying figures. The backend is therefore loaded first, so that restoring keeps
-    this setting.
+    Afterwards, the user's settings are restored. Matplotlib loads its backend with the first
+    figure. In notebooks, the backend then turns on a setting for displaying figures. The backend is
+    therefore loaded first, so that restoring keeps this setting.
+
+    Args:
+        kept: Beginnings of the names of the settings that stay as they are.
     """
     plt.draw_if_interactive()
-    with plt.style.context(style):
+    names: list[Any] = [name for name in mpl.rcParams if name.startswith(kept)]
+    users = {name: mpl.rcParams[name] for name in names}
+    with plt.style.context(["default", users, RC]):
         yield
 
 
-styled = drawing(RC)
-"""Decorator that applies `RC` to a function that draws a figure."""
+styled = drawing()
+"""Decorator that applies `drawing` to a function that draws a figure."""
 
 
 def panels(
@@ -97,6 +113,7 @@ def panels(
             panel.tick_params(labelsize=RC["xtick.labelsize"])
             for text in (panel.xaxis.label, panel.yaxis.label):
                 text.set_size(RC["axes.labelsize"])
+            panel.set_prop_cycle(None)  # the user's cycle may set markers and line styles
             _choose_ticks(panel)
         return given[:n]
 
