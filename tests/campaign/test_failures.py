@@ -102,6 +102,56 @@ def test_refused_hazard_leaves_the_previous_one(workspace, monkeypatch):
     assert campaign.hazard.identical(before)
 
 
+# --- past failures in the cells of a plan ---
+
+
+def test_a_plan_lists_the_failures_on_the_way_into_its_cells(workspace):
+    """A failure on the way into (1, 1) from the south-west, before a move to the north-east."""
+    campaign = begin(workspace)
+    campaign.suggest(path := ((3, 0), (2, 0), (1, 1), (0, 2), (0, 3)))
+    assert campaign.ask().past_failures == ()
+    campaign.tell(ModelSimulator(workspace, fail_at=2).run(path, seed=0))
+    planned = campaign.plan.path
+    in_plan = {(f.bound, f.way) for f in campaign.plan.past_failures}
+    assert in_plan == {(k, path[1:4]) for k, cell in enumerate(planned) if cell == path[2]}
+
+    p_fail = campaign.risk.mean[*bounds_and_next(path[1:4])[0]]
+    other_side = ((3, 0), (2, 1), (1, 1), (1, 2), (0, 3))
+    other_move = ((3, 0), (2, 0), (1, 1), (1, 2), (0, 3))
+    for suggested in (other_side, other_move, path):
+        campaign.suggest(suggested)
+        [failure] = campaign.ask().past_failures
+        assert failure[:4] == (2, 1, "stuck", path[1:4])
+        assert failure.p_fail == pytest.approx(p_fail, rel=1e-12)
+    assert campaign.ask().p_fail[1] == failure.p_fail
+
+    campaign.suggest(((3, 0), (2, 1), (1, 2), (0, 3)))
+    assert campaign.ask().past_failures == ()
+
+
+def test_past_failures_include_missions_given_up_and_are_stored(workspace, tmp_path):
+    campaign = begin(workspace, directory=tmp_path / "c")
+    path = campaign.ask().path
+    campaign.fail("stuck", where=path[1])
+    campaign.suggest(path)
+    [failure] = campaign.ask().past_failures
+    assert failure[:4] == (1, None, "stuck", path[:3])
+    campaign.close()
+    with tb.Campaign.load(tmp_path / "c") as again:
+        assert again.ask().past_failures == (failure,)
+
+
+def test_after_replanning_the_failure_of_this_mission_counts_for_the_rest(workspace):
+    path = ((3, 0), (2, 0), (1, 1), (0, 2), (0, 3))
+    campaign = begin(workspace)
+    campaign.suggest(path)
+    so_far = ModelSimulator(workspace, fail_at=2).run(path, seed=0)
+    rest = campaign.replan(path[1], so_far)
+    ahead = [k for k, cell in enumerate(rest.path) if cell == path[2] and k > rest.n_driven]
+    assert [failure.bound for failure in rest.past_failures] == ahead
+    assert {failure.mission for failure in rest.past_failures} <= {1}
+
+
 # --- bounds that are avoided ---
 
 

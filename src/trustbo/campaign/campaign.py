@@ -20,6 +20,7 @@ from trustbo.campaign.learning import (
     learn,
     learn_hazard,
 )
+from trustbo.campaign.past_failures import with_past_failures
 from trustbo.campaign.read import lock_campaign, read_campaign
 from trustbo.campaign.record import RECORD
 from trustbo.campaign.replan import follow, whole_plan
@@ -440,14 +441,16 @@ class Campaign(Result):
             draws = driven.filter.resample()
             rest = self._choose(rng, draws, planner)
             rest = rest.with_draws(planner.evaluate(rest.path, draws))
-            return self._record(whole_plan(self._base.problem, driven, rest), risk)
+            whole = whole_plan(self._base.problem, driven, rest)
+            return self._record(with_past_failures(whole, self.state, planner, so_far), risk)
 
     def _with_bands(self, plan: Plan) -> Plan:
         """Add the posterior bands to a plan."""
         return plan.with_draws(self.planner.evaluate(plan.path, self.forecast))
 
     def _accept(self, plan: Plan) -> Plan:
-        """Record a plan, with posterior bands, as the next one to run."""
+        """Record a plan, with posterior bands and past failures, as the next one to run."""
+        plan = with_past_failures(plan, self.state, self.planner)
         return self._record(self._with_bands(plan), self.risk)
 
     def _record(self, plan: Plan, risk: BoundRisk) -> Plan:

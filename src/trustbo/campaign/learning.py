@@ -161,16 +161,7 @@ def learn_hazard(state: State, workspace: Workspace, so_far: Mission | None = No
     progress are included as well. If the diagnostics fail, the previous posterior is returned with
     a warning.
     """
-    measured = [mission for mission in state.earlier.missions if not mission.map]
-    measured += [
-        _with_planned_path(entry.measured, entry.plan)
-        for entry in state.entries
-        if not is_excluded_by_user(entry)
-    ]
-    if so_far is not None:
-        plan = state.asked
-        measured.append(so_far if plan is None else _with_planned_path(so_far, plan))
-
+    measured = [mission for _, mission in missions_of_hazard(state, so_far)]
     prior = Hazard(**state.settings["hazard"])
     seed = state.seed_of("hazard")
     goal = tuple(state.settings["goal"])
@@ -183,6 +174,27 @@ def learn_hazard(state: State, workspace: Workspace, so_far: Mission | None = No
     if last is not None:
         return last["hazard"].to_dataset()
     return fit_hazard([], workspace, prior)
+
+
+def missions_of_hazard(
+    state: State, so_far: Mission | None = None
+) -> list[tuple[int | None, Mission]]:
+    """Return the measured missions from which the hazard is learned, with their numbers.
+
+    The numbers are those of `Result.table`; missions of earlier campaigns have none. A mission in
+    progress comes last. See `learn_hazard`.
+    """
+    measured: list[tuple[int | None, Mission]] = [
+        (None, mission) for mission in state.earlier.missions if not mission.map
+    ]
+    for number, entry in enumerate(state.entries, start=1):
+        if not is_excluded_by_user(entry):
+            measured.append((number, _with_planned_path(entry.measured, entry.plan)))
+    if so_far is not None:
+        plan = state.asked
+        mission = so_far if plan is None else _with_planned_path(so_far, plan)
+        measured.append((len(state.entries) + 1, mission))
+    return measured
 
 
 def _with_planned_path(mission: Mission, plan: Plan) -> Mission:

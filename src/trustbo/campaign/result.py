@@ -18,6 +18,7 @@ from trustbo.campaign.learning import (
     instead_of_failure,
     learn_hazard,
 )
+from trustbo.campaign.past_failures import with_past_failures
 from trustbo.campaign.read import read_campaign
 from trustbo.campaign.record import RECORD
 from trustbo.campaign.settings import to_planner
@@ -245,7 +246,7 @@ class Result(Summary):
     @computed
     def plan(self) -> Plan:
         """Recommended plan, the best under the posterior mean, with posterior credible bands."""
-        best = self.recommend()
+        best = with_past_failures(self.recommend(), self.state, self.planner)
         return best.with_draws(self.planner.evaluate(best.path, self.forecast))
 
     @property

@@ -39,6 +39,11 @@ class Failure(NamedTuple):
     path: tuple[Cell, ...] = ()
     where: Cell | None = None
 
+    @property
+    def lost(self) -> LostMission | None:
+        """The mission for the hazard; None if no bound caused the failure."""
+        return LostMission(self.path, self.where) if self.path else None
+
     def row(self) -> dict[str, Any]:
         """Return the failure's row in the table of missions."""
         return {
@@ -188,9 +193,7 @@ class State:
     @property
     def lost(self) -> list[LostMission]:
         """Missions without measurements in which a bound failed, earlier campaigns' first."""
-        own = [
-            LostMission(failure.path, failure.where) for failure in self.failures if failure.path
-        ]
+        own = [failure.lost for failure in self.failures if failure.lost is not None]
         return [*self.earlier.lost, *own]
 
     def copy(self) -> Self:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -13,6 +13,26 @@ from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
 """Quantile levels of `Plan.bands`: the ends of the 90 % and the 50 % bands."""
+
+
+class PastFailure(NamedTuple):
+    """Failure of a past mission in a bound into a cell that a plan enters.
+
+    A failure counts for the bound that failed, followed by the same next move. A plan may therefore
+    enter the same cell from another side, or leave it in another direction.
+    """
+
+    bound: int
+    """Number of the plan's bound into this cell, from 1."""
+    mission: int | None
+    """Number of the mission that failed; None if it has none, as after `Campaign.fail`."""
+    status: str
+    """Status of the bound that failed, such as "tipped"."""
+    way: tuple[Cell, ...]
+    """The cell left and the cell entered in the bound that failed, and the cell after them, if any.
+    If the planned next move is not known, the cell after them is that of the plan."""
+    p_fail: float
+    """Posterior mean probability that a bound on this way fails; compare `Plan.p_fail`."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,6 +66,9 @@ class Plan(Summary):
         value_band: Ends of the 90 % band of the value over the draws, computed with the mean
             failure probability; None with one draw. `value` may lie outside the band, because it
             limits trust to 1.
+        past_failures: Failures of past missions at known bounds into the cells that this path
+            enters, as named tuples with the fields `bound`, `mission`, `status`, `way` and
+            `p_fail`; only the plans of campaigns have them.
 
     Example:
         >>> plan = tb.Planner(workspace, (9, 0), (0, 9)).plan(posterior)
@@ -68,6 +91,7 @@ class Plan(Summary):
     value_band: tuple[float, float] | None = None
     blocked: tuple[tuple[Cell, ...], ...] = ()
     n_driven: int = 0
+    past_failures: tuple[PastFailure, ...] = ()
 
     def with_draws(self, given: Self) -> Self:
         """Return this plan with the bands of `given`, a plan for the same path and many draws."""
@@ -92,6 +116,8 @@ class Plan(Summary):
         if self.p_arrive is not None:
             beyond = "; the failure probability exceeds max_failure" if self.infeasible else ""
             rows.append(("arrival probability", f"{self.p_arrive:.3g}{beyond}"))
+        if self.past_failures:
+            rows.append(("past failures", "; ".join(past_failures_of(self))))
         if not np.isnan(self.limit):
             rows.append(("search", f"{1e3 * self.seconds:.1f} ms"))
 
@@ -157,6 +183,36 @@ class Plan(Summary):
         return tuple(map(posts.bound_routes, path, path[1:], onward))
 
 
+def past_failures_of(plan: Plan) -> list[str]:
+    """Describe the past failures of a plan, one text for each way that failed.
+
+    Each text compares the failure probability of the plan's bound with that of the way that failed.
+    """
+    p_fail = plan.p_fail
+    if p_fail is None:
+        return []
+
+    missions: dict[tuple[int, tuple[Cell, ...], float], list[str]] = {}
+    for failure in plan.past_failures:
+        key = failure.bound, failure.way, failure.p_fail
+        when = "" if failure.mission is None else f" in mission {failure.mission}"
+        missions.setdefault(key, []).append(failure.status + when)
+
+    texts = []
+    for (k, way, failed), which in missions.items():
+        planned = plan.path[k - 1 : k + 2]
+        text = (
+            f"bound {k} enters {path_text(planned[1:2])} from {path_text(planned[:1])} with "
+            f"failure probability {p_fail[k - 1]:.2g}"
+        )
+        if way[0] != planned[0]:
+            text += f"; from {path_text(way[:1])}, it is {failed:.2g}"
+        elif failed != p_fail[k - 1]:
+            text += f"; before another next move, it is {failed:.2g}"
+        texts.append(f"{text} ({', '.join(which)})")
+    return texts
+
+
 def plan_to_record(plan: Plan) -> dict[str, Any]:
     """Convert a plan, without its workspace, to plain lists and numbers."""
     values = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "workspace"}
@@ -179,5 +235,9 @@ def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
         values["risk"] = PathRisk.from_record(record["risk"])
 
     values["blocked"] = tuple(((a, b), (c, d)) for (a, b), (c, d) in record["blocked"])
+    values["past_failures"] = tuple(
+        PastFailure(bound, mission, status, tuple((row, col) for row, col in way), p_fail)
+        for bound, mission, status, way, p_fail in record.get("past_failures", ())
+    )
     values["path"] = tuple((row, col) for row, col in record["path"])
     return Plan(**values)
