@@ -2,6 +2,7 @@
 
 import base64
 import io
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from trustbo.data import Cell
 from trustbo.display import render
 from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
-from trustbo.planning import Plan
+from trustbo.planning.plan import past_failures_of
 from trustbo.plots.style import drawing
 from trustbo.team import Team
 
@@ -29,7 +30,7 @@ __dir__ = __all__.copy  # tab completion lists only public names
 _DRAWS = 50
 """Number of posterior draws for the uncertainty map."""
 _SHOWN = 3
-"""Number of bounds shown in detail; these are the bounds with the least trust."""
+"""Number of bounds shown in detail; these are the bounds with the least expected contact."""
 _NOT_PRINTED = "screen"
 """Class of sections that are not printed."""
 _LAST_PRINTED = "missions"
@@ -85,7 +86,7 @@ def write_report(path: FilePath, result: Result) -> None:
             _bounds(result),
             _missions(result),
             _maps(result),
-            _weakest(result.plan),
+            _weakest(result),
             _diagnostics(result),
             _settings(result),
         ],
@@ -96,14 +97,10 @@ def write_report(path: FilePath, result: Result) -> None:
 def facts_of(result: Result) -> dict[str, str]:
     """Return the facts, by name, that are needed to decide whether to drive the path."""
     plan = result.plan
-    problem = result.planner.problem
-    noise_sd = problem.recursion(result.belief.mean()).noise_sd
-    contact = np.minimum(problem.likelihood.mean_rate(plan.trust, noise_sd), 1.0).mean(1)
-    worst = int(np.argmin(contact))
-
+    bounds = bounds_of(result)
     rate = result.state.entries[-1].row["contact_rate"]
     last = f"{rate:.1%} of the time" if np.isfinite(rate) else "not measured"
-    cells = " → ".join(f"{row},{col}" for row, col in plan.path)
+    cells = " → ".join(_name(cell) for cell in plan.path)
     facts = {
         "Path": f"{cells} (row,column; row 0 is north)",
         "Length": f"{len(plan.path) - 1} bounds, {plan.length:.0f} m",
@@ -111,65 +108,115 @@ def facts_of(result: Result) -> dict[str, str]:
 
     if plan.p_arrive is not None and plan.risk is not None:
         low, high = plan.risk.p_arrive_band
-        band = f", {low:.0%} to {high:.0%} in 90 % of the draws" if np.isfinite(low) else ""
-        facts["Probability of arrival"] = (
-            f"{plan.p_arrive:.1%}{band}, given the robots' slope limit"
-        )
+        band = f", and {low:.1%} to {high:.1%} in 90 % of the draws" if np.isfinite(low) else ""
+        facts["Probability of arrival"] = f"{plan.p_arrive:.1%} on average{band}"
+    if plan.past_failures:
+        facts["Past failures"] = "; ".join(past_failures_of(plan))
+    contact = bounds["contact"].mean()
     return facts | {
-        "Expected contact": f"{contact.mean():.1%} of the time, averaged over robots and bounds",
-        "Weakest bound": f"bound {worst + 1} into cell {_name(plan.path[worst + 1])}, "
-        f"expected contact {contact[worst]:.1%}, {_measured(result, plan.path[worst : worst + 2])}",
-        "Uncertain": _uncertain(result),
+        "Expected contact": f"{contact:.1%} of the time, averaged over robots and bounds",
+        **_objective(result),
+        "Weakest bound": _weakest_bound(bounds),
+        "Uncertain": _uncertain(bounds),
         "Last mission": f"status {result.missions[-1].status}, contact {last}",
         "Reason for stopping": _ENDS.get(result.stop_reason, result.stop_reason),
     }
 
 
-def _measured(result: Result, bound: tuple[Cell, ...]) -> str:
-    """Return the measured contact of a bound, averaged over robots and missions, as text."""
-    rates = [
-        driven.contact_rate
-        for mission in result.missions
-        for cells, driven in zip(pairwise(mission.path), mission.bounds, strict=False)
-        if cells == bound
-    ]
-    known = [rate for rate in rates if np.isfinite(rate).any()]
-    if not rates:
-        return "not driven yet"
-    if not known:
-        return "driven but not measured"
+def bounds_of(result: Result) -> pd.DataFrame:
+    """Return what is known of each bound of the path, for all parts of the report.
 
-    often = "once" if len(known) == 1 else f"{len(known)} times"
-    mean = np.mean([np.nanmean(rate) for rate in known])
-    return f"measured contact {mean:.1%} (driven {often})"
+    The table has one row per bound, labelled by its number from 1, with the columns:
 
-
-def _uncertain(result: Result) -> str:
-    """Return which parts of the path are uncertain, as text."""
+    - `cell`: cell that the bound enters, as text.
+    - `trust`, `low`, `high`: expected trust and the ends of its 90 % interval, means of the robots.
+    - `contact`: expected contact rate, mean of the robots.
+    - `measured`: mean of the measured contact rates over missions and robots; NaN if there is none.
+    - `driven`: number of times that missions on this map began the bound, from the same cell.
+    """
     plan = result.plan
-    new = [_name(cell) for cell in plan.path[1:] if cell not in _driven(result)]
-    known = "every cell of the path was entered in a mission"
-    if new:
-        known = f"{len(new)} of {len(plan.path) - 1} cells were never entered: {', '.join(new)}"
+    problem = result.planner.problem
+    noise_sd = problem.recursion(result.belief.mean()).noise_sd
+    contact = np.minimum(problem.likelihood.mean_rate(plan.trust, noise_sd), 1.0)
 
-    low, high = (band.mean(1) for band in (plan.bands[0], plan.bands[-1]))
-    widest = int(np.argmax(high - low))
-    text = (
-        f"{known}; trust is least certain in bound {widest + 1} into cell "
-        f"{_name(plan.path[widest + 1])}, {low[widest]:z.2f} to {high[widest]:z.2f} with 90 % "
-        "probability"
+    earlier = [mission for mission in result.state.earlier.missions if not mission.map]
+    rates = defaultdict(list)  # by the cells left and entered
+    for mission in [*earlier, *result.missions]:
+        for ends, driven in zip(pairwise(mission.path), mission.bounds, strict=False):
+            rates[ends].append(driven.contact_rate)
+    of_path = [rates[ends] for ends in pairwise(plan.path)]
+
+    return pd.DataFrame(
+        {
+            "cell": [_name(cell) for cell in plan.path[1:]],
+            "trust": plan.trust.mean(1),
+            "low": plan.bands[0].mean(1),
+            "high": plan.bands[-1].mean(1),
+            "contact": contact.mean(1),
+            "measured": [_mean_rate(of_bound) for of_bound in of_path],
+            "driven": [len(of_bound) for of_bound in of_path],
+        },
+        index=pd.RangeIndex(1, len(plan.path), name="bound"),
     )
-    if plan.value_band is not None:
-        text += (
-            f"; the objective is {plan.value:z.3g} ({plan.value_band[0]:z.3g} to "
-            f"{plan.value_band[1]:z.3g} in 90 % of the draws)"
-        )
-    return text
 
 
-def _driven(result: Result) -> set[Cell]:
-    """Return the cells that were entered in a mission."""
-    return {bound.cell for mission in result.missions for bound in mission.bounds}
+def _mean_rate(rates: list[np.ndarray]) -> float:
+    """Return the mean over missions of the mean rate of the measured robots; NaN if none."""
+    known = [np.nanmean(rate) for rate in rates if np.isfinite(rate).any()]
+    return float(np.mean(known)) if known else np.nan
+
+
+def _objective(result: Result) -> dict[str, str]:
+    """Return the value of the objective, with the sign that it has in the table of missions."""
+    plan = result.plan
+    low, high = (np.nan, np.nan) if plan.value_band is None else plan.value_band
+    value = plan.value
+    name, unit = "Objective", ""
+    if plan.objective == "lost_contact":
+        name, unit = "Predicted contact lost", " bounds"
+        value, low, high = -value, -high, -low
+
+    band = f", {_number(low)} to {_number(high)} in 90 % of the draws" if np.isfinite(low) else ""
+    cost = result.planner.problem.cost_of_failure
+    costs = f"; includes a cost of {_number(cost)} bounds if the mission fails" if cost else ""
+    return {name: f"{_number(value)}{unit}{band}{costs}"}
+
+
+def _weakest_bound(bounds: pd.DataFrame) -> str:
+    """Describe the bound with the least expected contact."""
+    i = int(np.argmin(bounds["contact"]))
+    measured = bounds["measured"].to_numpy()[i]
+    text = f"{_label(bounds, i)}, expected contact {bounds['contact'].to_numpy()[i]:.1%}"
+    return text if np.isnan(measured) else f"{text}, measured contact {measured:.1%}"
+
+
+def _uncertain(bounds: pd.DataFrame) -> str:
+    """Describe which bounds were never driven, and where the interval of trust is widest."""
+    new = bounds.loc[bounds["driven"] == 0, "cell"]
+    text = "every bound of the path was driven before"
+    if len(new):
+        listed = ", ".join(f"{k} into {cell}" for k, cell in zip(new.index, new, strict=True))
+        text = f"{len(new)} of {len(bounds)} bounds were never driven: {listed}"
+
+    low = bounds["low"].to_numpy()
+    high = bounds["high"].to_numpy()
+    i = int(np.argmax(high - low))
+    return (
+        f"{text}; the widest 90 % interval of trust is {_number(low[i])} to {_number(high[i])}, in "
+        f"{_label(bounds, i)}"
+    )
+
+
+def _label(bounds: pd.DataFrame, i: int) -> str:
+    """Name the bound in row i of `bounds_of`: its number, its cell and how often it was driven."""
+    n = int(bounds["driven"].to_numpy()[i])
+    often = {0: "never driven", 1: "driven once"}.get(n, f"driven {n} times")
+    return f"bound {i + 1} into cell {bounds['cell'].to_numpy()[i]} ({often})"
+
+
+def _number(value: float) -> str:
+    """Format a number as in tables."""
+    return f"{value:z.3g}"
 
 
 def _path_map(result: Result) -> _Block:
@@ -184,37 +231,46 @@ def _path_map(result: Result) -> _Block:
 def _bounds(result: Result) -> _Section:
     """Make a table of the bounds of the path, with coordinates."""
     plan = result.plan
-    low, high = plan.bands[0], plan.bands[-1]
-    driven = _driven(result)
+    bounds = bounds_of(result)
     positions = plan.positions if plan.stops is None else plan.stops
 
-    columns: dict[str, Any] = {
-        "cell": [_name(cell) for cell in plan.path],
-        "x (m)": [f"{x:.1f}" for x in positions[:, 0]],
-        "y (m)": [f"{y:.1f}" for y in positions[:, 1]],
-        "expected trust": [np.nan, *plan.trust.mean(1)],
-        "5 %": [np.nan, *low.mean(1)],
-        "95 %": [np.nan, *high.mean(1)],
-    }
+    table = pd.DataFrame(
+        {
+            "cell": [_name(cell) for cell in plan.path],
+            "x (m)": [f"{x:.1f}" for x in positions[:, 0]],
+            "y (m)": [f"{y:.1f}" for y in positions[:, 1]],
+            "expected trust": [np.nan, *bounds["trust"]],
+            "5 %": [np.nan, *bounds["low"]],
+            "95 %": [np.nan, *bounds["high"]],
+            "expected contact": [np.nan, *bounds["contact"]],
+            "measured": [np.nan, *bounds["measured"]],
+        },
+        index=pd.RangeIndex(len(plan.path), name="bound"),
+    )
     if plan.p_fail is not None:
-        columns["p(failure)"] = [np.nan, *plan.p_fail]
-    columns["entered"] = ["start", *("yes" if c in driven else "no" for c in plan.path[1:])]
+        table["p(failure)"] = [np.nan, *plan.p_fail]
+    table["driven"] = ["start", *(f"{n}" for n in bounds["driven"])]
 
-    table = pd.DataFrame(columns, index=pd.RangeIndex(len(plan.path), name="bound"))
     where = "centre of the cell" if plan.stops is None else "stop of the lead"
-    note = f"x and y: {where}, {plan.workspace.grid.crs_name}. Bound 0 is the start."
+    note = (
+        f"x and y: {where}, {plan.workspace.grid.crs_name}. Bound 0 is the start. Trust and "
+        "contact are means of the robots. Driven: how often missions began the bound, from the "
+        "same cell; measured: mean of the contact rates in the bound."
+    )
     return _Section("Bounds of the path", [_table(table), _note(note)])
 
 
-def _weakest(plan: Plan) -> _Section:
-    """Plot the bounds with the least trust, if there is a terrain."""
+def _weakest(result: Result) -> _Section:
+    """Plot the bounds with the least expected contact, if there is a terrain."""
+    plan = result.plan
     if plan.stops is None:
         return _Section("Weakest bounds", [_note("Without a terrain, there are no posts.")])
 
-    weakest = sorted((np.argsort(plan.trust.mean(1))[:_SHOWN] + 1).tolist())
+    contact = bounds_of(result)["contact"].to_numpy()
+    weakest = sorted((np.argsort(contact)[:_SHOWN] + 1).tolist())
     text = (
-        "The bounds with the least trust. The robots watch from their posts while the lead drives, "
-        "and then drive to their next posts."
+        "The bounds with the least expected contact. The robots watch from their posts while the "
+        "lead drives, and then drive to their next posts."
     )
     return _Section(
         "Weakest bounds",
@@ -241,9 +297,10 @@ def _maps(result: Result) -> _Section:
             ),
             _note(
                 f"Expected trust in each cell, and the path planned with this trust. {scale} "
-                "Bright cells are good: high trust, or a small standard deviation. Trust in "
-                "hatched cells is only predicted from a map that may be outdated. The intervals "
-                "assume an adequate model (see trustbo.criticism)."
+                "Bright cells are good: high trust, or a small standard deviation. No mission has "
+                "entered hatched cells, so their trust is only predicted from a map that may be "
+                "outdated. Bounds into other cells may be new as well. The intervals assume an "
+                "adequate model (see trustbo.criticism)."
             ),
         ],
     )
@@ -303,7 +360,10 @@ def _missions(result: Result) -> _Section:
     if result.settings["objective"] == "lost_contact":
         shown["objective"] = -shown["objective"]
         shown = shown.rename(columns={"objective": "predicted_lost"})
-        about = "Contact lost is in bounds; predictions include the costs of failures."
+        about = (
+            "Contact lost is in bounds. Predicted losses include the costs of failures, measured "
+            "ones do not."
+        )
     shown.columns = [str(name).replace("_", " ") for name in shown.columns]
 
     about += " The value predicted for the plan of a mission is based on all earlier missions."
@@ -393,9 +453,7 @@ def _note(text: str) -> _Block:
 
 
 def _table(frame: pd.DataFrame) -> _Block:
-    html = frame.reset_index().to_html(
-        index=False, border=0, float_format=lambda x: f"{x:z.3g}", na_rep="-"
-    )
+    html = frame.reset_index().to_html(index=False, border=0, float_format=_number, na_rep="-")
     return _Block(table=html)
 
 

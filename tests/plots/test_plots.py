@@ -2,6 +2,7 @@
 
 import re
 from copy import copy
+from itertools import pairwise
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -16,7 +17,7 @@ import trustbo as tb
 from trustbo import plots
 from trustbo.plots.explorer import _layers
 from trustbo.plots.maps import contour_interval, contours, draw_path, extent_of, trust_limits
-from trustbo.report import facts_of, write_report
+from trustbo.report import bounds_of, facts_of, write_report
 
 EFFECTS = pd.DataFrame(
     [
@@ -301,16 +302,51 @@ def test_the_report_is_one_page_with_the_path_and_every_figure(result, tmp_path)
         assert re.search(rf'<section class="{screen}">\s*<h2>{heading}', html)
 
 
-def test_the_report_lists_the_cells_of_the_path_that_were_never_entered(result):
-    entered = {bound.cell for mission in result.missions for bound in mission.bounds}
-    longer = [(3, 0), (3, 1), (3, 2), (2, 2), (1, 2), (0, 2)]
-    new = [f"{row},{col}" for row, col in longer[1:] if (row, col) not in entered]
-    assert new
+def table_under(heading, page):
+    """The first table after a heading of a page, as texts."""
+    _, _, after = page.read_text(encoding="utf-8").partition(f"<h2>{heading}</h2>")
+    table, _, _ = after.partition("</table>")
+    columns, *rows = [re.findall(r"<t[hd][^>]*>([^<]*)<", row) for row in table.split("<tr")[1:]]
+    return pd.DataFrame(rows, columns=columns)
 
+
+def with_plan(result, path):
+    """Copy of a result that recommends another path."""
     other = copy(result)
     other._computed = dict(result._computed)
-    other._computed["plan"] = result.planner.evaluate(longer, result.forecast)
-    assert f"never entered: {', '.join(new)};" in facts_of(other)["Uncertain"]
+    other._computed["plan"] = result.planner.evaluate(path, result.forecast)
+    return other
+
+
+def test_the_report_has_one_definition_of_driven_bounds(result, tmp_path):
+    """Text, table and figure are of the same bounds; a cell entered from elsewhere is no bound."""
+    longer = [(3, 0), (3, 1), (3, 2), (2, 2), (1, 2), (0, 2)]
+    driven = [bound for mission in result.missions for bound in pairwise(mission.path)]
+    for other in (result, with_plan(result, longer)):
+        table = bounds_of(other)
+        expected = [driven.count(bound) for bound in pairwise(other.plan.path)]
+        assert table["driven"].tolist() == expected
+        assert np.isfinite(table["measured"]).tolist() == [n > 0 for n in expected]
+
+        facts = facts_of(other)
+        text = facts["Uncertain"].partition(";")[0].partition(": ")[2]
+        new = [k for k, n in enumerate(expected, start=1) if not n]
+        assert [int(k) for k in re.findall(r"(\d+) into", text)] == new
+
+        weakest = int(np.argmin(table["contact"])) + 1
+        assert re.match(r"bound (\d+)", facts["Weakest bound"])[1] == f"{weakest}"
+        write_report(tmp_path / "report.html", other)
+        shown = table_under("Bounds of the path", tmp_path / "report.html")
+        assert shown["driven"].tolist() == ["start", *map(str, expected)]
+
+
+def test_the_report_shows_the_objective_with_one_sign(result, tmp_path):
+    write_report(tmp_path / "report.html", result)
+    missions = table_under("Contact in each mission", tmp_path / "report.html")
+    assert (missions["predicted lost"].astype(float) > 0.0).all()
+    shown, low, high = re.findall(r"-?[\d.]+", facts_of(result)["Predicted contact lost"])[:3]
+    assert float(shown) == pytest.approx(-result.plan.value, rel=0.005)
+    assert float(low) < float(high)
 
 
 def test_the_report_shows_failed_bounds_and_the_measured_contact_of_the_weakest(tmp_path):
@@ -326,17 +362,13 @@ def test_the_report_shows_failed_bounds_and_the_measured_contact_of_the_weakest(
     assert "<th>failed bounds</th>" in html
     assert "<td>2 into 0,2 (stuck)</td>" in html
 
-    other = copy(campaign)
-    other._computed = dict(campaign._computed)
-    other._computed["plan"] = campaign.planner.evaluate(path, campaign.forecast)
-    weakest = facts_of(other)["Weakest bound"]
-    measured = {"bound 1": "80.0%", "bound 2": "30.0%"}[weakest[:7]]
-    assert f"measured contact {measured} (driven once)" in weakest
+    known = bounds_of(with_plan(campaign, path))
+    assert known["driven"].tolist() == [1, 1]
+    np.testing.assert_allclose(known["measured"], [0.8, 0.3])
 
-    other._computed["plan"] = campaign.planner.evaluate(
-        [(2, 0), (2, 1), (1, 2), (0, 2)], campaign.forecast
-    )
-    assert "not driven yet" in facts_of(other)["Weakest bound"]
+    around = bounds_of(with_plan(campaign, [(2, 0), (2, 1), (1, 2), (0, 2)]))
+    assert around["driven"].tolist() == [0, 0, 0]  # (0, 2) was entered from (1, 1) only
+    assert around["measured"].isna().all()
 
 
 def test_the_report_has_the_limits_of_all_robots_and_marks_replanned_missions(tmp_path):

@@ -1,5 +1,6 @@
 """A plan: a path with its expected trust and value, and the routes of the robots."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Self
@@ -7,7 +8,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from trustbo.data import Cell, path_text
-from trustbo.display import Rows, Summary
+from trustbo.display import Rows, Summary, joined
 from trustbo.hazard.risk import PathRisk
 from trustbo.workspace import Workspace
 
@@ -184,33 +185,56 @@ class Plan(Summary):
 
 
 def past_failures_of(plan: Plan) -> list[str]:
-    """Describe the past failures of a plan, one text for each way that failed.
+    """Describe the past failures of a plan, one text for each of its bounds.
 
-    Each text compares the failure probability of the plan's bound with that of the way that failed.
+    The texts compare the failure probability of the plan's bound with that of each way that failed.
     """
     p_fail = plan.p_fail
     if p_fail is None:
         return []
 
-    missions: dict[tuple[int, tuple[Cell, ...], float], list[str]] = {}
+    of_bounds: dict[int, list[PastFailure]] = {}
     for failure in plan.past_failures:
-        key = failure.bound, failure.way, failure.p_fail
-        when = "" if failure.mission is None else f" in mission {failure.mission}"
-        missions.setdefault(key, []).append(failure.status + when)
+        of_bounds.setdefault(failure.bound, []).append(failure)
 
     texts = []
-    for (k, way, failed), which in missions.items():
-        planned = plan.path[k - 1 : k + 2]
+    for k, failures in of_bounds.items():
+        left, entered = plan.path[k - 1 : k + 1]
+        p = float(p_fail[k - 1])
+        same = [failure for failure in failures if failure.way[0] == left and failure.p_fail == p]
         text = (
-            f"bound {k} enters {path_text(planned[1:2])} from {path_text(planned[:1])} with "
-            f"failure probability {p_fail[k - 1]:.2g}"
+            f"bound {k} enters {path_text([entered])} from {path_text([left])} with failure "
+            f"probability {p:.2g}{_when(same)}"
         )
-        if way[0] != planned[0]:
-            text += f"; from {path_text(way[:1])}, it is {failed:.2g}"
-        elif failed != p_fail[k - 1]:
-            text += f"; before another next move, it is {failed:.2g}"
-        texts.append(f"{text} ({', '.join(which)})")
+
+        others: dict[tuple[tuple[Cell, ...], float], list[PastFailure]] = {}
+        for failure in failures:
+            if failure not in same:
+                others.setdefault((failure.way, failure.p_fail), []).append(failure)
+        for (way, failed), which in others.items():
+            side = f"from {path_text(way[:1])}"
+            if way[0] == left:
+                side = "before another next move"
+            text += f"; {side}, it is {failed:.2g}{_when(which)}"
+        texts.append(text)
     return texts
+
+
+def _when(failures: Sequence[PastFailure]) -> str:
+    """Describe when failures happened, such as " (tipped in mission 3)"; empty without any."""
+    if not failures:
+        return ""
+    missions: dict[str, list[str]] = {}
+    for failure in failures:
+        numbers = missions.setdefault(failure.status, [])
+        if failure.mission is not None:
+            numbers.append(str(failure.mission))
+
+    texts = []
+    for status, numbers in missions.items():
+        plural = "missions" if len(numbers) > 1 else "mission"
+        texts.append(f"{status} in {plural} {joined(numbers)}" if numbers else status)
+    return f" ({', '.join(texts)})"
 
 
 def plan_to_record(plan: Plan) -> dict[str, Any]:
