@@ -1,6 +1,7 @@
 # make demo       install into .venv and run a campaign on a real hillside, whose map is old
 # make test       install what the tests need too, and run them
 # make jupyter    install JupyterLab and open copies of the notebooks, in out/notebooks
+#                 (in a container: make jupyter LAB=--ip=0.0.0.0)
 # make notebooks  run the notebooks, with fewer missions than they show
 # make slow       run the tests that take long, which make test leaves out
 # make lint       format, style, types, the direction of imports, and which files are tracked
@@ -15,6 +16,11 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 # A worker for each core, of which each takes up to 1.5 GB.
 PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist worksteal
+
+# JupyterLab refuses to run as root, the usual user of a container, unless it is told to.
+AS_ROOT = $(if $(filter 0,$(shell id -u)),--allow-root)
+# More options of JupyterLab.
+LAB =
 
 # Where a container's shell says so, Python would compile all modules anew at each start, 7 s.
 unexport PYTHONDONTWRITEBYTECODE
@@ -33,7 +39,7 @@ test: $(VENV)/.installed-dev
 jupyter: $(VENV)/.installed-notebook
 	mkdir -p out/notebooks
 	for file in notebooks/*.ipynb; do [ -e out/$$file ] || cp $$file out/$$file; done
-	$(BIN)/jupyter lab out/notebooks
+	$(BIN)/jupyter lab $(AS_ROOT) $(LAB) out/notebooks
 
 notebooks: $(VENV)/.installed-dev
 	rm -rf out/nbmake
