@@ -31,8 +31,9 @@ from trustbo.plots.maps import (
 from trustbo.plots.style import GREY, ROBOTS, outlined
 
 START, GOAL, MISSIONS = (9, 0), (0, 9), 8
-PLANNER = {"failure_cost": 0.0}  # the hillside is steep, but the robots can drive it
 HEIGHT, RADIUS = 3.0, 45.0
+RISKY = 0.1
+"""Failure probability above which a bound of the first path counts as risky."""
 BOUND = 10
 """Number of the bound of the new path that is drawn in panel (a), from 1."""
 ASPECT = 1.43
@@ -48,10 +49,10 @@ def main() -> None:
 
     mpl.use("agg")
     workspace = tb.Workspace.from_terrain(tb.terrain.example(), shape=(10, 10))
-    with tb.Campaign(
-        workspace, START, GOAL, directory=given.out, overwrite=True, planner=PLANNER
-    ) as campaign:
-        path = campaign.ask().path
+    with tb.Campaign(workspace, START, GOAL, directory=given.out, overwrite=True) as campaign:
+        first = campaign.ask()  # warns that failure is likely
+        say_why_failure_is_likely(first)
+        path = first.path
         center = workspace.grid.center(path[len(path) // 2])
         scrub = tb.simulation.Trees(HEIGHT, center, RADIUS)
         changed = tb.simulation.KinematicSimulator(workspace, events=[scrub])
@@ -60,14 +61,31 @@ def main() -> None:
 
     tb.report.write_report(given.out / "report.html", campaign)
     tb.export.export_result(campaign, given.out)
-    lost = campaign.history["contact_lost"].values
+    table = campaign.table()
+    lost = table["contact_lost"].to_numpy()
     print(
-        f"contact lost to scrub that the map does not show: {lost[0]:.1f} of {len(path) - 1} "
-        f"bounds in mission 1, and {lost[-1]:.1f} bounds on the new path in mission {MISSIONS}"
+        f"{(table['status'] == 'ok').sum()} of {MISSIONS} missions arrived; the recommended path "
+        f"arrives with probability {campaign.plan.p_arrive:.2f}"
+    )
+    print(
+        f"contact lost in mission 1, with scrub that the map does not show: {lost[0]:.1f} of "
+        f"{len(path) - 1} bounds; in mission {MISSIONS}, on a new path: {lost[-1]:.1f} of "
+        f"{table['n_bounds'].iloc[-1]} bounds"
     )
     print(f"results are in {given.out}; open {given.out / 'report.html'}")
     if given.picture is not None:
         draw(campaign, changed, center, given.picture)
+
+
+def say_why_failure_is_likely(plan: tb.planning.Plan) -> None:
+    """Print how probable arrival is before the first mission, and why."""
+    limit = np.rad2deg(plan.workspace.team.max_slope)
+    risky = (plan.p_fail > RISKY).sum()
+    print(
+        f"the first path arrives with probability {plan.p_arrive:.2f} under the prior: on {risky} "
+        f"of its {len(plan.p_fail)} bounds, robots nearly reach their slope limit of {limit:.0f} "
+        "degrees, and no mission has tested this limit yet"
+    )
 
 
 def draw(
@@ -79,9 +97,7 @@ def draw(
     """Draw a bound, the contact lost per mission, and trust and path before and after."""
     workspace = result.workspace
     right = tb.simulation.KinematicSimulator(workspace)
-    known = tb.iterate(
-        workspace, START, GOAL, n_iterations=MISSIONS, simulator=right, planner=PLANNER
-    )
+    known = tb.iterate(workspace, START, GOAL, n_iterations=MISSIONS, simulator=right)
 
     style = {"font.size": 9, "axes.titlesize": 10, "legend.frameon": False}
     with mpl.rc_context(style):
