@@ -191,7 +191,7 @@ def test_every_imported_package_is_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     required = [project["dependencies"], *project["optional-dependencies"].values()]
     declared = {re.match(r"[\w-]+", each)[0].lower() for part in required for each in part}
-    declared |= {name.replace("-", "_") for name in declared} | {"sklearn"}  # scikit-learn
+    declared |= {name.replace("-", "_") for name in declared}
 
     packages = {name.partition(".")[0] for name in imported_names()}
     assert packages - {*sys.stdlib_module_names, "trustbo"} - declared == set()

@@ -6,7 +6,6 @@ from typing import Self
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
-from sklearn.decomposition import PCA
 
 from trustbo.errors import TrustboError, require_kind, warn
 
@@ -77,9 +76,7 @@ class CompositeIndex:
         loadings = np.zeros(len(signs))
         ratios = np.ones(1)
         if varies.any():
-            pca = PCA(svd_solver="covariance_eigh").fit(z)
-            first = np.asarray(pca.components_)[0]
-            ratios = pca.explained_variance_ratio_
+            first, ratios = _first_component(z)
             loadings[varies] = (np.sign(first @ signs[varies]) or 1.0) * first
 
         score = z @ loadings[varies]
@@ -157,3 +154,21 @@ class CompositeIndex:
             dims = columns[0].dims
             columns = [x.transpose(*dims) if isinstance(x, xr.DataArray) else x for x in columns]
         return [np.asarray(x, float) for x in columns]
+
+
+def _first_component(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first principal component (feature,) of samples z (sample, feature).
+
+    The largest entry of the component is positive. Also returns the share of the variance of each
+    component, largest first.
+    """
+    n = len(z)
+    mean = z.mean(0)
+    covariance = z.T @ z
+    covariance -= n * mean[:, None] * mean  # without a centred copy of z
+    covariance /= n - 1
+
+    variances, components = np.linalg.eigh(covariance)
+    variances = np.maximum(variances[::-1], 0.0)  # rounding can make the smallest ones negative
+    first = components[:, -1]
+    return first * np.sign(first[np.abs(first).argmax()]), variances / variances.sum()
