@@ -6,9 +6,10 @@ Each notebook runs at full size in a temporary folder, and its file is not chang
 this script, whose exit status is 1 if it lists anything.
 
 Outputs: the script compares the numbers in the text outputs of each cell in order. It prints lines
-in which a number differs by more than the tolerance, relative to the largest number in the line.
-Monte Carlo results differ slightly between processors. Check whether the text of the notebook
-agrees with the new results, and store the new run if it does not.
+in which a number differs by more than the tolerance. The tolerance of whole numbers is relative to
+the number, and that of other numbers is relative to the largest of these in the line. Monte Carlo
+results differ slightly between processors. Check whether the text of the notebook agrees with the
+new results, and store the new run if it does not.
 
 Text: each number in a Markdown cell must be a number that the new run prints, or a number in the
 code, when both are rounded to the digits of the text. Signs do not count, and "40 %" also agrees
@@ -52,11 +53,22 @@ def differ(before: str, after: str, tolerance: float) -> bool:
     """Return whether the numbers of two lines, or the text between the numbers, differ."""
     if NUMBER.sub("", before).split() != NUMBER.sub("", after).split():
         return True
-    pairs = [[float(x) for x in NUMBER.findall(line)] for line in (before, after)]
-    limit = tolerance * max(map(abs, pairs[0]), default=0.0)
-    return len(pairs[0]) != len(pairs[1]) or any(
-        abs(old - new) > limit for old, new in zip(*pairs, strict=True)
-    )
+
+    old = NUMBER.findall(before)
+    new = NUMBER.findall(after)
+    if len(old) != len(new):
+        return True
+    largest = max((abs(float(x)) for x in old if not is_whole(x)), default=0.0)
+    for x, y in zip(old, new, strict=True):
+        scale = abs(float(x)) if is_whole(x) else largest
+        if abs(float(x) - float(y)) > tolerance * scale:
+            return True
+    return False
+
+
+def is_whole(number: str) -> bool:
+    """Return whether a number has no decimal point, such as a count or the index of a row."""
+    return number.lstrip("+-").isdecimal()
 
 
 def unshown(notebook: nbformat.NotebookNode) -> Iterator[tuple[str, str]]:

@@ -204,6 +204,22 @@ def test_a_notebook_is_run_and_what_does_not_agree_is_listed(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("before", "after", "different"),
+    [
+        ("8  0.18  0.15", "8  0.18  0.19", True),
+        ("8  0.180  0.002", "8  0.181  0.004", False),
+        ("kish 448", "kish 440", False),
+        ("kish 448", "kish 413", True),
+        ("(29, 0) (28, 0)", "(29, 0) (28, 1)", True),
+        ("3 missions", "3 bounds", True),
+        ("0.5", "0.5 0.5", True),
+    ],
+)
+def test_lines_differ_if_a_number_does_by_more_than_rounding(before, after, different):
+    assert compare_notebooks.differ(before, after, 0.05) == different
+
+
+@pytest.mark.parametrize(
     ("text", "found"),
     [
         ("0.75 of 3 and 4, -0.75, .8, 75 % and 1", []),
