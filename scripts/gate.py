@@ -27,6 +27,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
+from check_files import tracked
+
 ROOT = Path(__file__).resolve().parents[1]
 MANIFEST = "benchmarks/provenance.toml"
 FILES = ("benchmarks/reference/*.csv", "docs/figures/*", "notebooks/*.ipynb")
@@ -76,6 +78,9 @@ def faults(root: Path) -> Iterator[str]:
         for shown in entry.shows:
             if not any(covers(shown, result) for result in results):
                 yield f"{entry.name}: {shown} does not exist"
+        for path in entry.code:
+            if not git(root, "ls-files", "--", path):
+                yield f"{entry.name}: there is no code in {path}"
         if reason := why_stale(root, entry):
             yield "\n    ".join([f"{entry.name}: {reason}", *entry.shows, f"run: {entry.run}"])
 
@@ -98,7 +103,7 @@ def read_manifest(root: Path) -> list[Entry]:
 
 def results_of(root: Path) -> Iterator[str]:
     """Yield the tracked files that show results, and the tables of results on pages."""
-    for file in git(root, "ls-files", "-z").split("\0"):
+    for file in tracked(root):
         if any(fnmatch(file, pattern) for pattern in FILES):
             yield file
         elif file == "README.md" or fnmatch(file, "docs/*.md"):

@@ -152,6 +152,13 @@ def test_an_entry_whose_table_is_gone_is_listed(repository):
     assert fault.startswith("results: README.md#results ")
 
 
+def test_a_misspelt_path_of_code_is_listed(repository):
+    text = (repository / gate.MANIFEST).read_text()
+    write(repository, gate.MANIFEST, text.replace('["models"]', '["models", "scr"]'))
+    [fault] = gate.faults(repository)
+    assert fault.startswith("results: ")
+
+
 @pytest.mark.parametrize("has_commit", [False, True])
 def test_a_table_is_stale_if_its_code_has_changed(repository, has_commit):
     write(repository, "src/model.py", CODE.replace("0.5", "0.6"))
