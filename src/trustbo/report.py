@@ -185,9 +185,12 @@ def _objective(result: Result) -> dict[str, str]:
 def _weakest_bound(bounds: pd.DataFrame) -> str:
     """Describe the bound with the least expected contact."""
     i = int(np.argmin(bounds["contact"]))
+    expected = bounds["contact"].to_numpy()[i]
     measured = bounds["measured"].to_numpy()[i]
-    text = f"{_label(bounds, i)}, expected contact {bounds['contact'].to_numpy()[i]:.1%}"
-    return text if np.isnan(measured) else f"{text}, measured contact {measured:.1%}"
+    text = f"{_label(bounds, i)}, expected contact {expected:.1%}"
+    if np.isfinite(measured):
+        return f"{text}, measured contact {measured:.1%}"
+    return f"{text}, contact not measured" if bounds["driven"].to_numpy()[i] else text
 
 
 def _uncertain(bounds: pd.DataFrame) -> str:

@@ -6,13 +6,14 @@ another direction.
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
 from trustbo.campaign.learning import missions_of_hazard
-from trustbo.campaign.state import State, incomplete_bounds
+from trustbo.campaign.state import State
 from trustbo.data import Cell, Mission
-from trustbo.hazard.trials import UNKNOWN, Trials
+from trustbo.hazard.trials import CAUSES, UNKNOWN, Trials
 from trustbo.planning import Plan, Planner
 from trustbo.planning.plan import PastFailure
 from trustbo.workspace.moves import END, MOVES
@@ -64,10 +65,13 @@ def _failures(
     """
     goal = tuple(state.settings["goal"])
     for number, mission in missions_of_hazard(state, so_far):
-        incomplete = {cell: status for _, cell, status in incomplete_bounds(mission)}
-        if incomplete:
+        bounds = zip(pairwise(mission.path), mission.statuses, strict=False)
+        failed = {ends: status for ends, status in bounds if status in CAUSES}
+        if failed:
             for bound in _failed(Trials.from_missions([mission], goal=goal)):
-                yield number, incomplete[bound[1:3]], bound
+                move, row, col, _ = bound
+                left = _moved((row, col), move, -1)
+                yield number, failed[left, (row, col)], bound
 
     lost = [(_UNREPORTED, mission) for mission in state.earlier.lost]
     lost += [(one.reason, one.lost) for one in state.failures if one.lost is not None]
