@@ -485,9 +485,10 @@ class Campaign(Result):
         if self.planner.problem.objective.of_contact:
             remedy += ' or planner={"failure_cost": ...}'
         warn(
-            f"the plan arrives with probability {plan.p_arrive:.2f} only, which does not influence "
-            f"the choice of paths yet; pass {remedy}, or lower the max_slope of the robots. The "
-            "page Failures of the documentation explains this probability."
+            f"the plan arrives with a probability of only {plan.p_arrive:.2f}, and paths are "
+            "chosen without regard to this probability until a mission has failed. To avoid risky "
+            f"paths from the start, pass {remedy}. If the max_slope of the robots is uncertain, "
+            "lower it. The page Failures of the documentation explains the probability."
         )
 
     def tell(self, mission: Mission, *, again: bool = False) -> xr.DataTree | None:
