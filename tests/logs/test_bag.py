@@ -291,3 +291,139 @@ def test_messages_that_are_in_two_parts_of_a_bag_count_once(kind, workspace, tmp
     (other,) = read_bag(paths, workspace)
     np.testing.assert_array_equal(one.n_ticks, other.n_ticks)
     np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
+
+
+KINDS = ["log.bag", "sqlite3", "mcap"]
+PATH = [(2, 0), (1, 1), (0, 2)]
+
+
+def of_mission(version=2, *, begin=1.0, seed=0, length=10.0):
+    """A log of a mission of two bounds, whose robots have contact at random."""
+    rng = np.random.default_rng(seed)
+    log = Log(version)
+    for k, cell in enumerate(PATH):
+        start = begin + length * k
+        log.bound(start, k, *cell)
+        for i in range(8 if k else 0):
+            for robot in ("r1", "r2"):
+                log.contact(robot, (start + i + 0.5, bool(rng.random() < 0.6)))
+        if k:
+            log.text(start + length - 1.0, "/mission/status", "ok")
+    return log
+
+
+def part_of(log, first, last=None, *, delay=0.0, again=(), only=""):
+    """Messages as another recorder receives them, with latched ones that it has missed."""
+    part = Log(log.version)
+    part.messages = log.messages[first:last]
+    if again:
+        latched = [max(i for i in range(first) if log.messages[i][1] == topic) for topic in again]
+        begin = part.messages[0][0] - 10_000_000
+        part.messages[:0] = [(begin, *log.messages[i][1:]) for i in latched]
+    part.messages = [
+        (time + round(1e9 * delay), topic, *rest)
+        for time, topic, *rest in part.messages
+        if only in topic
+    ]
+    return part
+
+
+def read_parts(logs, workspace, folder, kind="sqlite3"):
+    paths = []
+    for i, log in enumerate(logs):
+        log.messages.sort(key=lambda message: message[0])
+        storage = {} if kind == "log.bag" else {"storage": kind}
+        paths.append(log.save(folder / f"{i}-{kind}", **storage))
+    return read_bag(paths, workspace)
+
+
+def assert_same_bounds(found, expected):
+    for one, other in zip(found, expected, strict=True):
+        assert (one.path, one.status) == (other.path, other.status)
+        np.testing.assert_array_equal(one.contact_rate, other.contact_rate)
+        np.testing.assert_array_equal(one.n_ticks, other.n_ticks)
+        np.testing.assert_allclose(one.duration, other.duration, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "again", [("/mission/bound",), ("/mission/bound", "/mission/status")], ids=["markers", "all"]
+)
+def test_messages_that_a_latched_topic_repeats_in_a_part_count_once(
+    kind, again, workspace, tmp_path
+):
+    whole = of_mission(1 if kind == "log.bag" else 2)
+    at = 27  # in bound 2, after the status of bound 1
+    parts = [part_of(whole, 0, at), part_of(whole, at, again=again)]
+    expected = read_parts([whole], workspace, tmp_path, kind)
+    (tmp_path / "parts").mkdir()
+    assert_same_bounds(read_parts(parts, workspace, tmp_path / "parts", kind), expected)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        lambda log: [part_of(log, 27), part_of(log, 0, 27)],
+        lambda log: [part_of(log, 0), part_of(log, 12, delay=0.02, again=("/mission/bound",))],
+        lambda log: [part_of(log, 5, delay=0.02, again=("/mission/bound",)), part_of(log, 0)],
+        lambda log: [part_of(log, 0, only="mission"), part_of(log, 0, only="contact")],
+        lambda log: [part_of(log, 0, only="mission"), part_of(log, 0, delay=0.05)],
+    ],
+    ids=["order", "late recorder", "late recorder first", "topics", "some topics"],
+)
+def test_bags_of_several_recorders_are_read_as_one(parts, workspace, tmp_path):
+    whole = of_mission()
+    expected = read_parts([whole], workspace, tmp_path)
+    (tmp_path / "parts").mkdir()
+    assert_same_bounds(read_parts(parts(whole), workspace, tmp_path / "parts"), expected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_markers_at_a_constant_rate_mark_each_bound_once(kind, workspace, tmp_path):
+    whole = of_mission(1 if kind == "log.bag" else 2)
+    expected = read_parts([whole], workspace, tmp_path, kind)
+    for k, cell in enumerate(PATH):
+        for i in range(1, 10):
+            whole.bound(1.0 + 10.0 * k + i, k, *cell)
+    (tmp_path / "again").mkdir()
+    assert_same_bounds(read_parts([whole], workspace, tmp_path / "again", kind), expected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("begin", [1.0, 12.5], ids=["at once", "later"])
+def test_a_clock_that_starts_again_is_named(kind, begin, workspace, tmp_path):
+    """The messages of two runs are mixed, in the order of their times."""
+    log = of_mission(1 if kind == "log.bag" else 2)
+    log.messages += of_mission(log.version, begin=begin, seed=1).messages
+    with pytest.raises(TrustboError, match="clock"):
+        read_parts([log], workspace, tmp_path, kind)
+
+
+def test_bags_of_two_runs_with_one_clock_are_refused(workspace, tmp_path):
+    with pytest.raises(TrustboError, match="clock"):
+        read_parts([of_mission(), of_mission(seed=1)], workspace, tmp_path)
+
+
+@pytest.mark.parametrize("delay", [3.0, -40.0])
+def test_recorders_whose_clocks_differ_are_named(delay, workspace, tmp_path):
+    log = of_mission()
+    second = of_mission(begin=60.0, seed=1)
+    log.messages += second.messages
+    with pytest.raises(TrustboError, match="clock"):
+        read_parts([log, part_of(log, 0, delay=delay)], workspace, tmp_path)
+
+
+def test_a_bound_that_is_marked_with_two_cells_is_refused(workspace, tmp_path):
+    log = of_mission()
+    log.bound(12.0, 1, 2, 1)
+    with pytest.raises(TrustboError, match="cells"):
+        read_parts([log], workspace, tmp_path)
+
+
+def test_a_path_planned_again_before_the_start_is_that_of_the_mission(workspace, tmp_path):
+    log = of_mission()
+    first = {"bound": 0, "cell": PATH[0], "path": [PATH[0], (1, 0), (0, 0)]}
+    for seconds, path in ((0.5, first["path"]), (1.5, PATH)):
+        log.text(seconds, "/mission/bound", json.dumps({**first, "path": path}))
+    (one,) = read_parts([log], workspace, tmp_path)
+    assert (one.path, one.status) == (tuple(PATH), "ok")

@@ -7,6 +7,7 @@
     /{robot}/contact  std_msgs/Bool, or Float32 or Float64 in [0, 1], at each tick: whether the
                       robot detects the lead or, while T2 closes up, the lead detects the robot
 
+A marker of the bound that has begun, which a latched topic repeats, is no new bound.
 A bound lasts from its marker to its status or, without a status, to the last contact message
 before the next marker. A status may arrive up to 1 s after the next marker if the bound has no
 other status; the bound then ends at this marker. The contact rate of a bound is the fraction of a
@@ -24,8 +25,14 @@ import numpy as np
 import pandas as pd
 
 from trustbo.data import Cell, Mission, require_unit_interval
-from trustbo.errors import TrustboError, one_line, require_pair, require_whole
+from trustbo.errors import TrustboError, require_pair, require_whole
 from trustbo.files import FilePath, to_path
+from trustbo.logs.recorders import (
+    joined,
+    require_in_order,
+    without_repeated_statuses,
+    without_repeats,
+)
 from trustbo.logs.statuses import ends_of, warn_of_ends
 from trustbo.logs.table import read_table
 from trustbo.workspace import Workspace
@@ -49,7 +56,9 @@ def read_bag(
 
     Args:
         path: A `.bag` file of ROS 1, or the folder of a bag of ROS 2; a list of them is read as one
-            bag that was split, whose parts may overlap.
+            bag. They may be the parts of a bag that was split, or bags of several recorders, with
+            the same or different topics, if their clocks differ by less than 1 s. A message that
+            several bags contain counts once.
         workspace: Workspace whose robots are read, in the order of its team.
         contact: Topic with the contact of a robot; its name replaces `{robot}`.
         prefix: Namespace of the topics of bounds and statuses, such as `"/fleet"` for
@@ -60,8 +69,8 @@ def read_bag(
 
     Raises:
         TrustboError: rosbags is not installed, the path is not a complete bag, a topic is missing
-            or of another type, markers are out of order, a bound has different statuses, or
-            `Mission` rejects the data.
+            or of another type, markers are out of order, a clock was set back, clocks of recorders
+            differ, a bound has different statuses, or `Mission` rejects the data.
 
     Warns:
         UserWarning: A status ends a bound although contact messages continue, or no contact message
@@ -86,20 +95,17 @@ def read_bag(
     ticks = seen.assign(robot=seen["topic"].map(of_topic), contact=seen["data"] > 0.5)
 
     marked = messages.loc[messages["topic"] == of_bounds, "data"]
-    statuses = messages.loc[messages["topic"] == of_statuses, "data"]
-    markers = sorted(_marker(time, text) for time, text in marked.items())
+    rows = sorted(_marker(time, text) for time, text in marked.items())
+    markers = pd.DataFrame(rows, columns=["begin", "bound", "cell", "path"])
 
-    bounds = pd.DataFrame(markers, columns=["begin", "bound", "cell", "path"])
+    bounds = without_repeats(markers)
     bounds["until"] = bounds["begin"].shift(-1, fill_value=_NEVER)
     bounds["mission"] = (bounds["bound"] == 0).cumsum()
+    require_in_order(_listed(paths), bounds, markers, ticks)
     missions = bounds.groupby("mission")
 
-    if bounds.empty or (bounds["bound"] != missions.cumcount()).any():
-        raise TrustboError(
-            f"the bounds in {_listed(paths)} must be marked 0, 1, 2, ... in order; the markers are "
-            f"{one_line(bounds['bound'].tolist())}. Leave out markers that were recorded twice."
-        )
-
+    statuses = messages.loc[messages["topic"] == of_statuses, "data"]
+    statuses = without_repeated_statuses(statuses, markers, bounds)
     ends = ends_of(bounds, statuses, ticks)
     warn_of_ends(bounds, ends, looks.index)
     tables = [
@@ -138,16 +144,20 @@ def _messages(
     except ImportError:
         raise TrustboError("ROS bags need rosbags: python -m pip install rosbags") from None
 
-    messages: list[tuple[int, str, Any]] = []
+    messages: list[list[tuple[int, str, Any]]] = [[] for _ in paths]
     try:
         # ROS 2 bags recorded before Iron do not define their message types.
         with AnyReader(paths, default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             there = {c.topic: c.msgtype for c in reader.connections}
             _require_topics(paths, there, bounds, contact, contacts)
-            chosen = [c for c in reader.connections if c.topic in (bounds, statuses, *contacts)]
-            for c, time, raw in reader.messages(connections=chosen):
-                kinds = (str,) if c.topic in (bounds, statuses) else (bool, int, float, np.number)
-                messages.append((time, c.topic, _data(reader, c, raw, kinds)))
+            for of_bag, part in zip(reader.readers, messages, strict=True):
+                of_topics = (bounds, statuses, *contacts)
+                chosen = [c for c in of_bag.connections if c.topic in of_topics]
+                found = of_bag.messages(connections=chosen) if chosen else ()
+                for c, time, raw in found:
+                    is_text = c.topic in (bounds, statuses)
+                    kinds = (str,) if is_text else (bool, int, float, np.number)
+                    part.append((time, c.topic, _data(reader, c, raw, kinds)))
     except TrustboError:
         raise
     except Exception as error:  # rosbags raises many types of errors for bad files
@@ -156,10 +166,12 @@ def _messages(
             "a complete .bag file of ROS 1, or the folder of a ROS 2 bag with its metadata.yaml."
         ) from None
 
-    table = pd.DataFrame(messages, columns=["time", "topic", "data"])
-    if len(paths) > 1:  # parts of a bag may overlap
-        table = table.drop_duplicates()
-    return table.set_index("time")
+    parts = [
+        # The files of a bag that was split are read one after another, although they may overlap.
+        pd.DataFrame(part, columns=["time", "topic", "data"]).sort_values("time", kind="stable")
+        for part in messages
+    ]
+    return joined([str(path) for path in paths], parts, bounds).set_index("time")
 
 
 def _data(reader: Any, connection: Any, raw: bytes, kinds: tuple[type, ...]) -> Any:
