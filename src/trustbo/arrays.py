@@ -109,6 +109,42 @@ def read_labelled(
     return Labelled(np.expand_dims(ordered, missing), found)
 
 
+def in_order(what: str, group: xr.Dataset, names: Mapping[str, Sequence[Any] | None]) -> xr.Dataset:
+    """Return a dataset whose labelled axes are in order; other axes are unchanged.
+
+    Args:
+        what: Name of the dataset in messages.
+        group: Dataset.
+        names: Labels along each axis in order, of which the dataset may lack some; None for an axis
+            whose labels are numbers, to be put in order.
+
+    Raises:
+        TrustboError: If a label is unknown or repeated.
+    """
+    order = {}
+    for axis, index in group.indexes.items():
+        if axis not in names:
+            continue
+        wanted = names[str(axis)]
+        ranks = index.to_numpy() if wanted is None else _ranks(what, str(axis), index, wanted)
+        if (ranks[1:] < ranks[:-1]).any():
+            order[axis] = np.argsort(ranks, kind="stable")
+    return group.isel(order) if order else group
+
+
+def _ranks(what: str, axis: str, index: pd.Index, names: Sequence[Any]) -> np.ndarray:
+    """Return the position of each label of an axis among its names."""
+    labels = [str(label) for label in index]
+    known = [str(name) for name in names]
+    if len(set(labels)) < len(labels) or not set(labels) <= set(known):
+        kind = axis.removesuffix("_")  # of the second axis of a matrix
+        raise TrustboError(
+            f"{what} has the {kind}s {', '.join(labels)}, not {', '.join(known)}; rename them, or "
+            "leave out those that are not among these."
+        )
+    return np.array([known.index(label) for label in labels], dtype=int)
+
+
 def as_array(what: str, values: ArrayLike) -> np.ndarray:
     """Return an array of floats, NaN where masked, without regard to labels.
 

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.arrays import read_labelled
+from trustbo.arrays import in_order, read_labelled
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import OldName, Renamed, TrustboError, one_line, require_whole
@@ -21,6 +21,10 @@ from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES, bounds_and_next
 
 ROUNDING = 1e-12
 """Tolerance for rounding errors when the risk of a path is compared with its limit."""
+_DIMS = ("draw", "lost", "measure", "bound", "axis", "move", "row", "col", "next_move")
+"""Axes of the group `hazard`, in order."""
+_LABELS = {"draw": None, "axis": _DIMS[-4:], "move": MOVE_NAMES, "next_move": NEXT_NAMES}
+"""Labels of its axes, in order; None for numbers."""
 _WEIGHT_ROUNDING = 1e-6
 """Tolerance for rounding errors in the sum of the weights of components."""
 _BAND = (0.05, 0.95)
@@ -64,6 +68,8 @@ class BoundRisk(Summary):
         """
         difficulty = difficulty_of(workspace)
         shape = difficulty.unit.shape
+        hazard = in_order("the hazard posterior", hazard, _LABELS)
+        hazard = hazard.transpose(*_DIMS, missing_dims="ignore")
         if hazard["trials"].shape != shape:
             raise TrustboError(
                 f"the hazard posterior has trials of the shape {hazard['trials'].shape}; for this "

@@ -18,7 +18,7 @@ import xarray as xr
 from scipy import sparse
 
 from trustbo.inference.density import chunks
-from trustbo.inference.draws import missions_of, read_posterior, require_posterior
+from trustbo.inference.draws import as_fitted, missions_of, read_posterior
 from trustbo.inference.functions.fit import forms_of_function
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.inference.learner import FunctionLearner, Model, learner_of_posterior
@@ -91,7 +91,7 @@ def by_rate(posterior: xr.DataTree, *, model: Model | None = None) -> xr.DataTre
     Example:
         >>> az.plot_loo_pit(tb.inference.by_rate(posterior))
     """
-    posterior = require_posterior("by_rate", posterior)
+    posterior = as_fitted("by_rate", posterior)
     sizes = posterior["posterior"].sizes
     n_chains = sizes["chain"]
     n_rates = int(posterior["observed_data"][RATES].notnull().sum()) if _has_data(posterior) else 1

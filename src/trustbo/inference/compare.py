@@ -96,9 +96,13 @@ def _require_same_data(targets: Mapping[str, LeftOut]) -> None:
     reference = targets[first]
     for name in others:
         one = targets[name]
-        pairs = [(reference.contact_rate, one.contact_rate)]
+        order = list(range(one.contact_rate.shape[-1]))
+        if one.robots and sorted(one.robots) == sorted(reference.robots):
+            order = [one.robots.index(robot) for robot in reference.robots]
+
+        pairs = [(reference.contact_rate, one.contact_rate[..., order])]
         if reference.n_ticks is not None and one.n_ticks is not None:
-            pairs.append((reference.n_ticks, one.n_ticks))
+            pairs.append((reference.n_ticks, one.n_ticks[..., order]))
         for a, b in pairs:
             if a.shape != b.shape or not np.allclose(a, b, rtol=0.0, atol=_SINGLE, equal_nan=True):
                 raise TrustboError(
@@ -106,7 +110,7 @@ def _require_same_data(targets: Mapping[str, LeftOut]) -> None:
                     f"shape {b.shape} and {a.shape}; fit both to the same missions."
                 )
 
-        if (reference.is_density != one.is_density).any():
+        if (reference.is_density != one.is_density[..., order]).any():
             dense, other = (first, name) if reference.is_density.any() else (name, first)
             raise TrustboError(
                 f"the log-likelihoods of {dense!r} are densities of rates, and those of {other!r} "

@@ -1,17 +1,25 @@
 """Read parameters, missions and models from a posterior."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from trustbo.arrays import in_order
 from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError, require_count, require_kind, require_whole
 from trustbo.inference.density import Density, JointDraws
-from trustbo.inference.place_maps import place_group, place_maps_of, robots_in_bounds_of
+from trustbo.inference.functions.data import require_same_order
+from trustbo.inference.functions.function import is_of_function
+from trustbo.inference.place_maps import (
+    in_order_of_places,
+    place_group,
+    place_maps_of,
+    robots_in_bounds_of,
+)
 from trustbo.inference.variables import draws_of, prior_parameters
 from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
@@ -31,10 +39,24 @@ _N_MEAN = 4096
 """Number of draws averaged to compute a prior mean."""
 _ATTRIBUTES = ("family", "model_record")
 """Attributes that a posterior must have."""
+_NUMBERED = ("chain", "draw", "mission", "bound")
+"""Axes of all posteriors whose labels are numbers."""
+_AXES = (*_NUMBERED, "robot", "robot_", "feature", "feature_")
+"""Order of the axes of arrays; other axes follow."""
+_OF_VARIABLES = ("posterior", "prior")
+"""Groups that contain the variables of a function."""
 
 
-def require_posterior(who: str, value: object) -> xr.DataTree:
-    """Return `value` if it is a posterior from `fit`, otherwise raise TrustboError naming `who`."""
+def as_fitted(who: str, value: object) -> xr.DataTree:
+    """Return a posterior from `fit` in the order of the fit, which xarray may have changed.
+
+    Robots and features are put in order by name, and chains, draws, missions, bounds and places by
+    number, so that all that follows may read arrays by position.
+
+    Raises:
+        TrustboError: If the value is not a posterior from `fit`, it has no draws, or a robot or
+            feature has another name than in the fit. The message names `who`.
+    """
     if not isinstance(value, xr.DataTree):
         remedy = " Give the attribute .posterior." if hasattr(value, "posterior") else ""
         raise TrustboError(f"{who} needs a posterior from fit; got {type(value).__name__}.{remedy}")
@@ -55,7 +77,7 @@ def require_posterior(who: str, value: object) -> xr.DataTree:
             f"{who} needs the draws of a posterior, with the dims chain and draw, but there is no "
             f"{lacks[0]}. Keep all draws, or select with a list, such as posterior.isel(chain=[0])."
         )
-    return value
+    return _in_order(value, names_in(value, "robot"), names_in(value, "feature"))
 
 
 def parameters_of(
@@ -133,9 +155,11 @@ def _read_params(
             "a posterior of HumanTrust cannot be used for planning; to predict reports, use "
             "trustbo.inference.predict_reports."
         )
+    names = names_in(posterior, "robot"), names_in(posterior, "feature")
     if workspace is not None:
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-        posterior = in_order_of(posterior, workspace.team.names, workspace.features)
+        names = workspace.team.names, workspace.features
+    posterior = in_order_of(posterior, *names)
 
     model = model_of(posterior)
     parameters = parameters_of(posterior, model)
@@ -171,10 +195,9 @@ def _read_params(
         params = assemble_params(ahead, x0, memory)
         params = params._replace(**maps)  # pyright: ignore
         if is_drawn and places is not None:
-            names = places["robot"].values.tolist() if workspace is None else workspace.team.names
-            own = robots_in_bounds_of(places, parameters, names)
+            own = robots_in_bounds_of(places, parameters, names[0])
             params = params._replace(place_robot=own)
-        found.append(params)
+        found.append(params.in_order(*names))
     return found
 
 
@@ -225,8 +248,12 @@ def _robot_effects_ahead(
 
 
 def names_in(posterior: xr.DataTree, axis: str) -> tuple[str, ...]:
-    """Return the names of the robots or features of a posterior; empty if it has none."""
-    if f"{axis}s" in posterior.attrs:  # of a function; a file stores a single name as a text
+    """Return the names of the robots or features of a posterior, in the order of the fit.
+
+    Posteriors of earlier versions do not record them; the order is then that of their arrays, or
+    the result is empty.
+    """
+    if f"{axis}s" in posterior.attrs:  # a file stores a single name as a text
         return tuple(np.atleast_1d(posterior.attrs[f"{axis}s"]).tolist())
 
     for group in ("posterior", "robots", "constant_data"):
@@ -240,47 +267,102 @@ def in_order_of(
 ) -> xr.DataTree:
     """Return a posterior with its robots and features in the order of these names.
 
-    Parameters that all robots share apply to robots with any names. Robots that occur only in
-    missions of earlier campaigns (attribute `other_robots`) are left out, unless they are in
-    `robots`. Raises TrustboError if names differ or, for a posterior of a function, are in another
-    order.
+    All other labelled axes are put in order as by `as_fitted`. Parameters that all robots share
+    apply to robots with any names. Robots that occur only in missions of earlier campaigns
+    (attribute `other_robots`) are left out, unless they are in `robots`. Raises TrustboError if
+    names differ or, for a posterior of a function, are in another order.
     """
     if is_by_position(posterior):
-        require_same_order(posterior, robots, features)
-        return posterior
+        require_same_order(
+            posterior.attrs["model"],
+            {axis: names_in(posterior, axis) for axis in ("robot", "feature")},
+            {"robot": robots, "feature": features},
+        )
+    else:
+        others = np.atleast_1d(posterior.attrs.get("other_robots", [])).tolist()
+        if others and not set(others) <= set(robots):
+            posterior = _without_robots(posterior, [name for name in others if name not in robots])
+        if "robot" not in posterior["posterior"].dims and "robots" not in posterior.children:
+            robots = names_in(posterior, "robot")  # shared by all robots
 
-    others = np.atleast_1d(posterior.attrs.get("other_robots", [])).tolist()
-    if others and not set(others) <= set(robots):
-        posterior = _without_robots(posterior, [name for name in others if name not in robots])
-    is_shared = "robot" not in posterior["posterior"].dims and "robots" not in posterior.children
-    order = {}
-    for axis, names in {"feature": list(features), "robot": list(robots)}.items():
-        have = list(names_in(posterior, axis))
-        if have == names or not have or (axis == "robot" and is_shared):
-            continue
+    for axis, names in {"robot": robots, "feature": features}.items():
+        _require_names(posterior, axis, names)
+    return _in_order(posterior, robots, features)
 
-        if sorted(have) != sorted(names):
+
+def _require_names(posterior: xr.DataTree, axis: str, names: Sequence[str]) -> None:
+    """Raise TrustboError if the robots or features of a posterior are not those of `names`."""
+    found = [names_in(posterior, axis)]
+    for group in posterior.children.values():
+        if axis in group.indexes:
+            found.append(tuple(str(name) for name in group.indexes[axis]))
+
+    for have in found:
+        if have and sorted(have) != sorted(names):
             raise TrustboError(
                 f"the posterior has the {axis}s {', '.join(have)}, not {', '.join(names)}; fit "
                 "missions with these names."
             )
-        order[axis] = names
-    if not order:
+
+
+def _in_order(
+    posterior: xr.DataTree, robots: Sequence[str], features: Sequence[str]
+) -> xr.DataTree:
+    """Return a posterior with its robots and features in this order, and other axes by number."""
+    names: dict[str, Sequence[Any] | None] = dict.fromkeys(_NUMBERED)
+    dims: dict[str, list[str]] = {}
+    if is_by_position(posterior):
+        dims = json.loads(posterior["posterior"].attrs.get("dims", "{}"))
+        names |= dict.fromkeys(dim for of_variable in dims.values() for dim in of_variable)
+    else:
+        for effect in effects_of(posterior):
+            names |= effect.coords
+
+    for axis, of_axis in {"robot": robots, "feature": features}.items():
+        if of_axis:
+            names[axis] = of_axis
+            names[f"{axis}_"] = of_axis  # second axis of a matrix, or of means over robots
+
+    changed = {}
+    for name, group in posterior.children.items():
+        given = group.to_dataset()
+        ordered = in_order("the posterior", given, names)
+        if name == "places":
+            ordered = in_order_of_places(ordered)
+        of_variables = dims if name in _OF_VARIABLES else {}
+        ordered = _transposed(ordered, of_variables)
+        if ordered is not given:
+            changed[name] = ordered
+
+    same_robots = tuple(robots) == names_in(posterior, "robot")
+    if not changed and same_robots and tuple(features) == names_in(posterior, "feature"):
         return posterior
 
-    if "robot" in order:
-        order["robot_"] = order["robot"]  # second axis of a matrix (robot, robot)
-    if "feature" in order:
-        order["feature_"] = order["feature"]  # axis of means over robots
+    groups = {name: group.to_dataset() for name, group in posterior.children.items()}
+    whole = xr.DataTree.from_dict(groups | changed)
+    whole.attrs = posterior.attrs | {"robots": list(robots), "features": list(features)}
+    return whole
 
-    def sort(group: xr.Dataset) -> xr.Dataset:
-        return group.sel({axis: names for axis, names in order.items() if axis in group.indexes})
 
-    ordered = xr.DataTree.from_dict(
-        {n: sort(g.to_dataset()) for n, g in posterior.children.items()}
-    )
-    ordered.attrs = posterior.attrs
-    return ordered
+def _transposed(group: xr.Dataset, dims: Mapping[str, Sequence[str]]) -> xr.Dataset:
+    """Return a group with the axes of each variable in order.
+
+    `dims` has the axes of the variables of a function, after (chain, draw), which may be in any
+    order. The axes of all other variables have the order `_AXES`.
+    """
+    turned = {}
+    for name, array in group.data_vars.items():
+        axes = tuple(sorted(array.dims, key=_position))
+        if name in dims:
+            axes = ("chain", "draw", *dims[str(name)])
+        if axes != array.dims and set(axes) == set(array.dims):
+            turned[name] = array.transpose(*axes)
+    return group.assign(turned) if turned else group
+
+
+def _position(axis: Hashable) -> int:
+    """Return the position of an axis in the order of the axes of posteriors."""
+    return _AXES.index(axis) if axis in _AXES else len(_AXES)
 
 
 def _without_robots(posterior: xr.DataTree, others: Sequence[str]) -> xr.DataTree:
@@ -291,27 +373,16 @@ def _without_robots(posterior: xr.DataTree, others: Sequence[str]) -> xr.DataTre
         return group.drop_sel({axis: list(others) for axis in axes})
 
     kept = xr.DataTree.from_dict({n: drop(g.to_dataset()) for n, g in posterior.children.items()})
-    kept.attrs = posterior.attrs | {"n_robots": posterior.attrs["n_robots"] - len(others)}
+    kept.attrs = posterior.attrs | {
+        "n_robots": posterior.attrs["n_robots"] - len(others),
+        "robots": [name for name in names_in(posterior, "robot") if name not in others],
+    }
     return kept
 
 
 def is_by_position(posterior: xr.DataTree) -> bool:
     """Return whether a posterior is of a function, which identifies robots by their position."""
-    return "robots" in posterior.attrs
-
-
-def require_same_order(
-    posterior: xr.DataTree, robots: Sequence[str], features: Sequence[str]
-) -> None:
-    """Raise TrustboError if a posterior of a function has other names, or another order of them."""
-    for axis, names in {"robot": tuple(robots), "feature": tuple(features)}.items():
-        have = names_in(posterior, axis)
-        if have != names:
-            raise TrustboError(
-                f"the function {posterior.attrs['model']} was fitted to missions with the "
-                f"{axis}s {', '.join(have)}, not {', '.join(names)}. A function reads them by "
-                "position, so give the same names in the same order."
-            )
+    return is_of_function(json.loads(posterior.attrs["model_record"]))
 
 
 def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:

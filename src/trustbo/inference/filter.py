@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import Names, read_labelled
 from trustbo.data import Cell, require_shares, require_unit_interval
 from trustbo.errors import Renamed, TrustboError, one_line, require_pair, require_whole
-from trustbo.inference.draws import names_in, require_posterior
+from trustbo.inference.draws import as_fitted
 from trustbo.inference.importance import systematic
 from trustbo.inference.learner import params_of
 from trustbo.models.draws import Draws
@@ -110,7 +110,8 @@ class TrustFilter:
             family: Observation family of parameter draws; ignored for a DataTree.
             max_draws: Maximum number of draws; if there are more, evenly spaced draws are selected.
             workspace: Workspace that determines the order of robots and features in all arrays. By
-                default, arrays without labels are in the order of the draws.
+                default, arrays without labels are in the order of the missions of the fit, or in
+                that of the parameters.
 
         Raises:
             TrustboError: If the robots or features of the posterior differ from those of the
@@ -118,19 +119,13 @@ class TrustFilter:
                 `fit`; or `TrustParams` are given without `n_robots`.
         """
         self._bounded = True
-        self._names: dict[str, Names | None] = {"robot": None, "feature": None}
-        if workspace is not None:
-            self._names = {"robot": workspace.team.names, "feature": workspace.features}
-
         if isinstance(posterior, xr.DataTree):
-            require_posterior("TrustFilter", posterior)
-            if "constant_data" in posterior.children:  # without a map, any awareness is valid
-                self._bounded = bool((posterior["constant_data"]["row"] >= 0).any())
-            n_robots = posterior.attrs["n_robots"]
-            family = posterior.attrs["family"]
-            if workspace is None:
-                self._names = {axis: names_in(posterior, axis) or None for axis in self._names}
-            posterior = params_of(posterior, workspace, next_mission=True)
+            tree = as_fitted("TrustFilter", posterior)
+            if "constant_data" in tree.children:  # without a map, any awareness is valid
+                self._bounded = bool((tree["constant_data"]["row"] >= 0).any())
+            n_robots = tree.attrs["n_robots"] if workspace is None else None
+            family = tree.attrs["family"]
+            posterior = params_of(tree, workspace, next_mission=True)
         elif not isinstance(posterior, Draws):
             raise TrustboError(
                 "TrustFilter needs a posterior from fit or parameter draws; got "
@@ -138,6 +133,13 @@ class TrustFilter:
                 "use the `belief` of the campaign instead."
             )
 
+        if workspace is not None:
+            posterior = posterior.in_order(workspace.team.names, workspace.features)
+            n_robots = workspace.team.n_robots if n_robots is None else n_robots
+        self._names: dict[str, Names | None] = {
+            "robot": posterior.robots or None,
+            "feature": posterior.features or None,
+        }
         if n_robots is None:
             n_robots = posterior.n_robots
         if n_robots is None:

@@ -21,6 +21,7 @@ from trustbo.errors import (
     require_whole,
 )
 from trustbo.inference.density import SWEEPS, Coefficients, Density, JointDraws
+from trustbo.inference.draws import as_fitted, names_in
 from trustbo.inference.functions.fit import (
     fit_function,
     require_poolable_with_function,
@@ -142,6 +143,12 @@ def fit(
     """
     started = time.perf_counter()
     missions, robots = _joined(missions, earlier, workspace)
+    if start is not None:
+        start = as_fitted("start", start)
+        same_robots = names_in(start, "robot") in ((), missions[0].robots)
+        same_features = names_in(start, "feature") in ((), missions[0].features)
+        if not (same_robots and same_features):
+            start = None  # its scores belong to other robots or features
 
     if model is None:
         scale = missions[0].scale  # empty unless the missions are people's reports
@@ -285,6 +292,7 @@ def _fit_model(
     if "proposal" in summary:
         tree["sample_stats"].attrs["proposal"] = summary.pop("proposal")
     tree.attrs |= _record(model, density) | summary | {"sampler": sampler, "seed": seed}
+    tree.attrs |= {"robots": list(missions[0].robots), "features": list(missions[0].features)}
     tree.attrs |= library_attrs(sampler)
 
     def add_latent(posterior: xr.DataTree) -> xr.DataTree:

@@ -13,13 +13,13 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.errors import Renamed, TrustboError, require_kind, see
 from trustbo.inference.draws import (
+    as_fitted,
     expected_and_drawn_of_model,
     in_order_of_features,
     missions_of,
     params_of_model,
     prior_mean,
     read_posterior,
-    require_posterior,
     sample_prior,
     sample_prior_ahead,
 )
@@ -397,7 +397,7 @@ def params_of(
         >>> params = tb.inference.params_of(posterior, workspace)  # leading axis (draw,)
         >>> tb.Planner(workspace, (9, 0), (0, 9)).plan(params.mean()).path
     """
-    require_posterior("params_of", posterior)
+    posterior = as_fitted("params_of", posterior)
     learner = learner_of_posterior(posterior, model)
     return learner.draws(posterior, workspace, next_mission=next_mission)
 
@@ -407,7 +407,7 @@ def expected_and_drawn(
     posterior: xr.DataTree, workspace: Workspace | None = None
 ) -> tuple[Draws, Draws]:
     """Return `params_of` without and with `next_mission`; the posterior is read once."""
-    require_posterior("params_of", posterior)
+    posterior = as_fitted("params_of", posterior)
     return learner_of_posterior(posterior).expected_and_drawn(posterior, workspace)
 
 
@@ -443,7 +443,8 @@ def add_latent(
         >>> tb.inference.add_latent(posterior)["latent"]["trust_mean"].dims
         ('mission', 'bound', 'robot')
     """
-    if "latent" in require_posterior("add_latent", posterior).children:
+    posterior = as_fitted("add_latent", posterior)
+    if "latent" in posterior.children:
         return posterior
 
     missions = missions_of(posterior) if missions is None else missions

@@ -22,11 +22,18 @@ from arviz_stats import sampling_diagnostics
 from arviz_stats.utils import ELPDData
 from scipy.special import logsumexp
 
+from trustbo.arrays import in_order
 from trustbo.data import Mission
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, warn
 from trustbo.inference.density import Density, at
-from trustbo.inference.draws import joined_draws, missions_of, read_posterior, require_posterior
+from trustbo.inference.draws import (
+    as_fitted,
+    joined_draws,
+    missions_of,
+    names_in,
+    read_posterior,
+)
 from trustbo.inference.fit import by_importance
 from trustbo.inference.functions.fit import fit_function, log_likelihood_of_function
 from trustbo.inference.functions.function import FunctionModel
@@ -56,6 +63,8 @@ class LeftOut(NamedTuple):
 
     labels: np.ndarray
     """Label (mission,) of each mission in the posterior."""
+    robots: tuple[str, ...]
+    """Names of the robots; empty if they are not known."""
     contact_rate: np.ndarray
     """Rates (mission, bound, robot)."""
     n_ticks: np.ndarray | None
@@ -127,7 +136,7 @@ def left_out(who: str, posterior: xr.DataTree, model: Model | None = None) -> Le
     if isinstance(posterior, xr.DataTree) and "model_record" not in posterior.attrs:
         return _of_own(who, posterior)
 
-    posterior = require_posterior(who, posterior)
+    posterior = as_fitted(who, posterior)
     learner = learner_of_posterior(posterior, model)
     if isinstance(learner, FunctionLearner):
         return _of_function(posterior, learner.model)
@@ -253,6 +262,7 @@ def _of_class(posterior: xr.DataTree, model: Model | None) -> LeftOut:
 
     return LeftOut(
         labels=_labels(posterior),
+        robots=names_in(posterior, "robot"),
         contact_rate=y,
         n_ticks=n_ticks,
         is_density=is_density,
@@ -316,6 +326,7 @@ def _of_function(posterior: xr.DataTree, model: FunctionModel) -> LeftOut:
 
     return LeftOut(
         labels=_labels(posterior),
+        robots=names_in(posterior, "robot"),
         contact_rate=observations.contact_rate,
         n_ticks=observations.n_ticks,
         is_density=is_measured & (not of_counts),
@@ -355,8 +366,8 @@ def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
                 f"no {RATES!r} in the group {group!r}."
             )
 
-    y = np.asarray(tree["observed_data"][RATES].values, float)
-    log_p = tree["log_likelihood"].to_dataset()[RATES]
+    y = np.asarray(_by_number(tree["observed_data"])[RATES].values, float)
+    log_p = _by_number(tree["log_likelihood"])[RATES]
     dims = log_p.dims
     if y.ndim != 3 or dims[:2] != ("chain", "draw") or log_p.shape[2:] != y.shape[:1]:
         raise TrustboError(
@@ -379,7 +390,7 @@ def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
             "log probability of counts; give n_ticks= to ContactRate."
         )
 
-    ticks = tree["constant_data"] if "constant_data" in tree.children else {}
+    ticks = _by_number(tree["constant_data"]) if "constant_data" in tree.children else {}
     is_measured = ~np.isnan(y)
     measured = is_measured.any((1, 2))
     ess = sampling_diagnostics.ess(log_p.isel({dims[2]: measured}), method="bulk")
@@ -387,6 +398,7 @@ def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
     n_effective = min(float(ess.min()), float(n_draws))
     return LeftOut(
         labels=log_p[dims[2]].values,
+        robots=(),
         contact_rate=y,
         n_ticks=np.asarray(ticks["n_ticks"].values, float) if "n_ticks" in ticks else None,
         is_density=is_measured & (of == RATES),
@@ -398,3 +410,10 @@ def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
         fewest=_FEWEST,
         refit=None,
     )
+
+
+def _by_number(group: xr.DataTree) -> xr.Dataset:
+    """Return a group with all axes whose labels are numbers in order, such as missions."""
+    data = group.to_dataset()
+    numbers = [axis for axis, index in data.indexes.items() if index.dtype.kind in "iuf"]
+    return in_order("the posterior", data, {str(axis): None for axis in numbers})

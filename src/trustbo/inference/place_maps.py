@@ -128,6 +128,19 @@ def robots_in_bounds_of(
     return RobotsInBounds(known, column, tau_r, np.arange(len(tau_r)), seed)
 
 
+def in_order_of_places(group: xr.Dataset) -> xr.Dataset:
+    """Return the posterior group `places` with its places in the order of `models.Visited`."""
+    order = {}
+    for axis, names in {"cell": _CELL, "bound": _BOUND}.items():
+        keys = [group[f"{axis}_{name}"].values for name in names]
+        if f"{axis}_map" in group.coords:
+            keys.insert(0, group[f"{axis}_map"].values)
+        by_place = np.lexsort(keys[::-1])
+        if (by_place[1:] < by_place[:-1]).any():
+            order[axis] = by_place
+    return group.isel(order) if order else group
+
+
 def of_workspace(group: xr.Dataset) -> xr.Dataset:
     """Return the posterior group `places` without places on other maps."""
     if "cell_map" not in group.coords:

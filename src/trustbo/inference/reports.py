@@ -9,7 +9,7 @@ import xarray as xr
 from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_choice, require_count, require_whole
 from trustbo.inference.density import Density, JointDraws
-from trustbo.inference.draws import QUANTILES, is_of_people, read_posterior, require_posterior
+from trustbo.inference.draws import QUANTILES, as_fitted, is_of_people, read_posterior
 from trustbo.inference.latent import predictors
 from trustbo.models.model import TrustModel
 from trustbo.parallel import computing
@@ -72,7 +72,8 @@ def predict_reports(
         >>> posterior = tb.fit(people)
         >>> tb.inference.predict_reports(posterior, people, fitted=True).attrs["mae"]
     """
-    if not is_of_people(require_posterior("predict_reports", posterior)):
+    posterior = as_fitted("predict_reports", posterior)
+    if not is_of_people(posterior):
         raise TrustboError(
             "predict_reports needs a posterior of HumanTrust; got a posterior of "
             f"{posterior.attrs.get('model')}. Use trustbo.inference.score for contact rates."

@@ -7,7 +7,7 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_kind, require_list, require_whole
-from trustbo.inference.draws import QUANTILES, in_order_of, require_posterior
+from trustbo.inference.draws import QUANTILES, as_fitted, in_order_of
 from trustbo.inference.filter import TrustFilter
 from trustbo.models.observations import Observations, require_ticks
 from trustbo.parallel import computing
@@ -234,7 +234,7 @@ def predictions(
         known = range(len(missions))
 
     if isinstance(posterior, xr.DataTree) or not isinstance(posterior, Sequence):
-        return [require_posterior(who, posterior)] * len(known), list(known)
+        return [as_fitted(who, posterior)] * len(known), list(known)
 
     last = last_posterior(who, posterior)
     if not len(missions) - 1 <= len(posterior) <= len(missions):
@@ -245,7 +245,7 @@ def predictions(
 
     used = np.intersect1d(known, last.attrs.get("missions", known))
     pairs = [
-        (require_posterior(who, tree), j)
+        (as_fitted(who, tree), j)
         for j, tree in enumerate(posterior[: len(missions) - 1], start=1)
         if tree is not None and j in used
     ]
@@ -260,7 +260,7 @@ def last_posterior(who: str, posteriors: Sequence[xr.DataTree | None]) -> xr.Dat
             f"{who} needs a posterior, but nothing has been learned yet; run a mission with "
             "measured contact rates first."
         )
-    return require_posterior(who, trees[-1])
+    return as_fitted(who, trees[-1])
 
 
 def _pit(drawn: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Draws of the parameters of any trust model, as planners, filters and simulators need them."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -19,6 +20,17 @@ class Draws(ABC):
 
     x0_mean: Any
     """Mean of trust before the first bound, shape () or (...,)."""
+    robots: tuple[str, ...] | None
+    """Names of the robots, in the order of the arrays; None if they are not known."""
+    features: tuple[str, ...] | None
+    """Names of the features, in the order of the arrays; None if they are not known."""
+
+    @abstractmethod
+    def in_order(self, robots: Sequence[str], features: Sequence[str]) -> Self:
+        """Return the draws with their robots and features in the order of these names.
+
+        Draws without names are in this order already. Raises TrustboError if names differ.
+        """
 
     @property
     @abstractmethod

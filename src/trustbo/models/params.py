@@ -4,8 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
+import pandas as pd
+import xarray as xr
 
-from trustbo.arrays import require_numbers
+from trustbo.arrays import Names, read_labelled, require_numbers
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.models.draws import Draws
@@ -20,6 +22,8 @@ PLACES: Mapping[str, tuple[str, ...]] = {
     "place_bound": ("effect", "move", "row", "col"),
 }
 """Axes of the fields that contain place effects, after the leading axes."""
+_NOT_ARRAYS = ("memory", "place_robot", "robots", "features")
+"""Fields that are not arrays."""
 
 
 class ParameterDraws(Summary, Draws):
@@ -36,6 +40,8 @@ class ParameterDraws(Summary, Draws):
     BY_ROBOT: ClassVar[bool] = False
     """Whether coefficients differ between robots; if so, b has the axis (robot,)."""
     place_robot: RobotsInBounds | None
+    robots: Names | None
+    features: Names | None
     _fields: ClassVar[tuple[str, ...]]
 
     def _rows(self) -> Rows:
@@ -48,8 +54,7 @@ class ParameterDraws(Summary, Draws):
     @property
     def by_name(self) -> dict[str, Numbers]:
         """Arrays by name, excluding fields that are None."""
-        names = [name for name in self._fields if name not in ("memory", "place_robot")]
-        values = {name: getattr(self, name) for name in names}
+        values = {name: getattr(self, name) for name in self._fields if name not in _NOT_ARRAYS}
         return {name: value for name, value in values.items() if value is not None}
 
     @property
@@ -125,6 +130,65 @@ class ParameterDraws(Summary, Draws):
         if n_features is not None:
             require_shapes(params, n_robots, n_features)
         require_covariances(params)
+
+    def in_order(self, robots: Sequence[str], features: Sequence[str]) -> Self:
+        """See `Draws.in_order`; fields that are labelled arrays are read by their labels.
+
+        Parameters that all robots share apply to robots with any names.
+        """
+        wanted = {"robot": tuple(robots), "feature": tuple(features)}
+        own = {
+            "robot": self.robots or wanted["robot"],
+            "feature": self.features or wanted["feature"],
+        }
+
+        params = self._without_labels(own)
+        for axis, names in wanted.items():
+            if own[axis] != names and not (axis == "robot" and self._is_shared):
+                params = params._turned(axis, own[axis], names)
+        return params._replace(robots=wanted["robot"], features=wanted["feature"])  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def _is_shared(self) -> bool:
+        """Whether no field depends on the robot."""
+        n_effects = [effect.shape[-len(PLACES[name])] for name, effect in self.places.items()]
+        return not self.BY_ROBOT and self.place_robot is None and max(n_effects, default=1) == 1
+
+    def _without_labels(self, names: Mapping[str, Names]) -> Self:
+        """Read fields with labels, such as DataArrays, by the names of robots and features."""
+        labels = {**names, "robot_": names["robot"]}
+        read = {}
+        for field, value in self.by_name.items():
+            axes = self.AXES.get(field, ())
+            if isinstance(value, xr.DataArray):
+                leading = [str(dim) for dim in value.dims if dim not in axes]
+            elif axes and isinstance(value, pd.Series | pd.DataFrame | Mapping):
+                leading = []
+            else:
+                continue
+            read[field] = read_labelled(f"params.{field}", value, (*leading, *axes), labels).values
+        return self._replace(**read)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _turned(self, axis: str, own: Names, names: Names) -> Self:
+        """Return the parameters with the robots or features `own` in the order of `names`."""
+        if sorted(own) != sorted(names):
+            raise TrustboError(
+                f"the parameters have the {axis}s {', '.join(own)}, not {', '.join(names)}; give "
+                "parameters of the same names."
+            )
+        order = [own.index(name) for name in names]
+        turned: dict[str, Any] = {}
+        for field, value in self.by_name.items():
+            axes = self.AXES.get(field, ())
+            for i, one in enumerate(axes, start=-len(axes)):
+                is_effect = one == "effect" and axis == "robot" and np.shape(value)[i] > 1
+                if is_effect or one.removesuffix("_") == axis:
+                    turned[field] = np.take(turned.get(field, value), order, axis=i)
+
+        if axis == "robot" and self.place_robot is not None:
+            known = self.place_robot.known[..., order, :]
+            turned["place_robot"] = self.place_robot._replace(known=known)
+        return self._replace(**turned)  # pyright: ignore[reportAttributeAccessIssue]
 
     def inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
         """Compute the input u = sum_m beta_m z_m + b of bounds, with any place effects.
@@ -248,6 +312,8 @@ class _Trust(NamedTuple):
     memory: str = "level"
     delta_s: Numbers | None = None
     place_robot: RobotsInBounds | None = None
+    robots: Names | None = None
+    features: Names | None = None
 
 
 class TrustParams(ParameterDraws, _Trust):
@@ -268,6 +334,9 @@ class TrustParams(ParameterDraws, _Trust):
         memory: Quantity carried over between bounds, `"level"` or `"deviation"`; see `PooledTrust`.
         delta_s: Standard deviation of the noise that all robots share, shape (...,), or None.
         place_robot: Effects of robots in bounds, used in forecasts of the default model, or None.
+        robots: Names of the robots, or None. Parameters of a posterior have the names of the fit,
+            and planners, filters and simulators put them in the order of their workspace.
+        features: Names of the features, or None.
 
     Example:
         >>> beta = np.array([0.1, 0.1, 0.3])  # of traversability, visibility and line of sight
@@ -319,6 +388,8 @@ class _Coupled(NamedTuple):
     place: Numbers | None = None
     place_bound: Numbers | None = None
     place_robot: RobotsInBounds | None = None
+    robots: Names | None = None
+    features: Names | None = None
 
 
 class CoupledParams(ParameterDraws, _Coupled):
@@ -326,7 +397,7 @@ class CoupledParams(ParameterDraws, _Coupled):
 
     The fields are B0 (..., robot, robot'), B (..., feature, robot, robot'), b (..., robot), and the
     covariances Delta_w and Delta_v (..., robot, robot'). The fields x0_mean, x0_sd, place,
-    place_bound and place_robot are the same as in `TrustParams`.
+    place_bound, place_robot, robots and features are the same as in `TrustParams`.
 
     Example:
         >>> posterior = tb.fit(missions, tb.models.CoupledTrust())

@@ -405,19 +405,20 @@ def draws_of(
 ) -> Draws:
     """Return the draws of a posterior or parameters, with a leading axis (draw,) if there is one.
 
-    The features and robots of a posterior are reordered by name to match the workspace. See
+    The features and robots are reordered by name to match the workspace, if they have names. See
     `params_of` for `next_mission`. Raises TrustboError if the type, the features or the robots
     are wrong.
     """
     if isinstance(posterior, xr.DataTree):
         return params_of(posterior, workspace, next_mission=next_mission)
-    return _require_draws(posterior)
+    return _require_draws(posterior, workspace)
 
 
-def _require_draws(given: object) -> Draws:
-    """Return draws that can be used, with at most one leading axis (draw,)."""
+def _require_draws(given: object, workspace: Workspace) -> Draws:
+    """Return draws that can be used in a workspace, with at most one leading axis (draw,)."""
     remedy = "give a posterior from fit, or parameters"
     draws: Draws = require_kind("posterior", given, Draws, remedy)
+    draws = draws.in_order(workspace.team.names, workspace.features)
     draws.require_valid()
     return draws.flat() if len(draws.leading) > 1 else draws
 
@@ -426,7 +427,7 @@ def robot_draws_of(posterior: Draws | xr.DataTree, workspace: Workspace) -> Draw
     """Return the same as `draws_of`, but with the effects of robots in bounds, which plans omit."""
     if isinstance(posterior, xr.DataTree):
         return with_robots_in_bounds(*expected_and_drawn(posterior, workspace))
-    return _require_draws(posterior)
+    return _require_draws(posterior, workspace)
 
 
 def with_robots_in_bounds(expected: Draws, drawn: Draws) -> Draws:
@@ -455,7 +456,7 @@ def mean_and_draws_of(
         expected, drawn = expected_and_drawn(params, workspace)
         return expected.mean(), drawn
 
-    draws = _require_draws(params)
+    draws = _require_draws(params, workspace)
     if not draws.leading:
         return draws, None
     return draws.mean(), draws

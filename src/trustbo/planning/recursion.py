@@ -156,8 +156,8 @@ def expected_trust(
     params.require_valid()
 
     dims = ("bound", "robot", "feature")
-    unnamed = {"robot": None, "feature": None}
-    z = read_labelled("awareness", awareness, dims, unnamed).values
+    names = {"robot": params.robots or None, "feature": params.features or None}
+    z = read_labelled("awareness", awareness, dims, names).values
     if z.ndim != len(dims) or not z.size:
         raise TrustboError(f"awareness must have the shape (bound, robot, feature); got {z.shape}.")
     if x0 is not None:

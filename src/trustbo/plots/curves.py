@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice, require_kind, require_whole
-from trustbo.inference.draws import require_posterior
+from trustbo.inference.draws import as_fitted
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.plots.style import (
     GREY,
@@ -106,7 +106,7 @@ def _latent_trust(
     posterior: xr.DataTree, mission: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Sequence[str]]:
     """Return bounds, trust medians and quantiles, contact rates and robots of a mission."""
-    require_posterior("trust_curves", posterior)
+    posterior = as_fitted("trust_curves", posterior)
     if "latent" not in posterior.children:
         raise TrustboError(
             "this posterior has no latent trust; use inference.add_latent(posterior, missions)."

@@ -66,7 +66,7 @@ class ModelSimulator(DescribedSimulator):
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         require_kind("params", params, Draws, "give parameters, such as TrustParams(...)")
         self.workspace = workspace
-        self.params = params
+        self.params = params = params.in_order(workspace.team.names, workspace.features)
         self.model = PooledTrust() if model is None else model
 
         shape = workspace.awareness.shape

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from trustbo.data import Mission
+from trustbo.errors import TrustboError
 from trustbo.models.observations import Observations
 from trustbo.workspace.moves import bounds_along
 
@@ -143,6 +144,26 @@ def data_of_example(
 def observations_of(data: Data) -> Observations:
     """Return inputs as `Observations`."""
     return Observations(data[RATES], data["awareness"], data["n_ticks"], data["features"])
+
+
+def require_same_order(
+    name: str, own: Mapping[str, Sequence[str]], given: Mapping[str, Sequence[str]]
+) -> None:
+    """Raise TrustboError if a function was fitted to other robots or features, or another order.
+
+    Args:
+        name: Name of the function.
+        own: Names of the robots and features of the fit, by axis.
+        given: Names for which the function is to be used, by axis.
+    """
+    for axis, names in given.items():
+        have = own[axis]
+        if tuple(have) != tuple(names):
+            raise TrustboError(
+                f"the function {name} was fitted to missions with the {axis}s {', '.join(have)}, "
+                f"not {', '.join(names)}. A function reads them by position, so give the same "
+                "names in the same order."
+            )
 
 
 def _power_of_two(n: int) -> int:

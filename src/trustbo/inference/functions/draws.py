@@ -13,6 +13,7 @@ from trustbo.inference.functions.data import (
     arrays_of,
     data_of_bounds,
     observations_of,
+    require_same_order,
 )
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.models.backend import own_settings
@@ -42,6 +43,8 @@ class FunctionDraws(Draws):
         shape: Number of rows and columns of the map; None without a map.
     """
 
+    robots: tuple[str, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
+    features: tuple[str, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
     __slots__ = (
         "_form",
         "_is_flat",
@@ -76,6 +79,12 @@ class FunctionDraws(Draws):
     def __repr__(self) -> str:
         what = "mean of " if self._of_mean else ""
         return f"FunctionDraws({what}{len(self._numbers)} draws of {self.model.in_short()})"
+
+    def in_order(self, robots: Sequence[str], features: Sequence[str]) -> "FunctionDraws":
+        """See `Draws.in_order`; a function cannot change the order, in which it was fitted."""
+        own = {"robot": self.robots, "feature": self.features}
+        require_same_order(self.model.name, own, {"robot": robots, "feature": features})
+        return self
 
     @property
     def leading(self) -> tuple[int, ...]:

@@ -13,7 +13,7 @@ from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, require_kind, warn
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, statistics_of
-from trustbo.inference.draws import joined_draws, names_in, require_same_order
+from trustbo.inference.draws import in_order_of, joined_draws, names_in
 from trustbo.inference.functions.checks import require_fittable, require_unpadded_results
 from trustbo.inference.functions.data import (
     RATES,
@@ -302,8 +302,10 @@ def draws_of_function(
     shape: Any = None
     if workspace is not None:
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
-        require_same_order(posterior, workspace.team.names, workspace.features)
+        robots = workspace.team.names
+        features = workspace.features
         shape = workspace.passable.shape
+    posterior = in_order_of(posterior, robots, features)
 
     draws = posterior["posterior"].to_dataset()
     names = json.loads(draws.attrs["common"])
@@ -709,6 +711,7 @@ def _tree(
     tree = to_datatree(groups, missions, dims, labels=labels)
     common = [name for name, site in sites.items() if site.mission_axis is None]
     tree["posterior"].attrs["common"] = json.dumps(common)
+    tree["posterior"].attrs["dims"] = json.dumps(dims)
     return tree
 
 
