@@ -366,8 +366,8 @@ def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
                 f"no {RATES!r} in the group {group!r}."
             )
 
-    y = np.asarray(_by_number(tree["observed_data"])[RATES].values, float)
-    log_p = _by_number(tree["log_likelihood"])[RATES]
+    y = np.asarray(_by_number(tree, "observed_data")[RATES].values, float)
+    log_p = _by_number(tree, "log_likelihood")[RATES]
     dims = log_p.dims
     if y.ndim != 3 or dims[:2] != ("chain", "draw") or log_p.shape[2:] != y.shape[:1]:
         raise TrustboError(
@@ -390,7 +390,7 @@ def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
             "log probability of counts; give n_ticks= to ContactRate."
         )
 
-    ticks = _by_number(tree["constant_data"]) if "constant_data" in tree.children else {}
+    ticks = _by_number(tree, "constant_data") if "constant_data" in tree.children else {}
     is_measured = ~np.isnan(y)
     measured = is_measured.any((1, 2))
     ess = sampling_diagnostics.ess(log_p.isel({dims[2]: measured}), method="bulk")
@@ -412,8 +412,8 @@ def _of_own(who: str, tree: xr.DataTree) -> LeftOut:
     )
 
 
-def _by_number(group: xr.DataTree) -> xr.Dataset:
+def _by_number(tree: xr.DataTree, group: str) -> xr.Dataset:
     """Return a group with all axes whose labels are numbers in order, such as missions."""
-    data = group.to_dataset()
+    data = tree[group].to_dataset()
     numbers = [axis for axis, index in data.indexes.items() if index.dtype.kind in "iuf"]
     return in_order("the posterior", data, {str(axis): None for axis in numbers})

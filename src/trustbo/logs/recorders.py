@@ -61,11 +61,12 @@ def _is_new(kept: pd.DataFrame, part: pd.DataFrame) -> np.ndarray:
     """Return whether each message of a bag is not among those of other bags; see `joined`."""
     away = np.full(len(part), np.inf)  # from the nearest message on the same topic, ns
     is_within = np.zeros(len(part), dtype=bool)  # between two messages on the same topic
-    for topic, times in kept.groupby("topic")["time"]:
+    for topic, known in kept.groupby("topic"):
+        times = known["time"].to_numpy()
         of_topic = (part["topic"] == topic).to_numpy()
         own = part["time"].to_numpy()[of_topic]
         away[of_topic] = _distance(times, own)
-        is_within[of_topic] = (own >= times.iloc[0]) & (own <= times.iloc[-1])
+        is_within[of_topic] = (own >= times[0]) & (own <= times[-1])
 
     # The last messages of the other bags may have been received after their end.
     delay = np.median(away[is_within]) if is_within.any() else 0.0
@@ -73,20 +74,19 @@ def _is_new(kept: pd.DataFrame, part: pd.DataFrame) -> np.ndarray:
     return is_outside | (away > _GAP * _NANOSECONDS)
 
 
-def _distance(times: pd.Series, others: np.ndarray) -> np.ndarray:
+def _distance(times: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the distance of each of the other times from the nearest of the sorted times, ns."""
-    known = times.to_numpy()
-    after = np.searchsorted(known, others)
-    next_one = known[np.minimum(after, len(known) - 1)]
-    last_one = known[np.maximum(after - 1, 0)]
+    after = np.searchsorted(times, others)
+    next_one = times[np.minimum(after, len(times) - 1)]
+    last_one = times[np.maximum(after - 1, 0)]
     return np.minimum(np.abs(next_one - others), np.abs(others - last_one))
 
 
 def _require_same_run(first: str, name: str, kept: pd.DataFrame, part: pd.DataFrame) -> None:
     """Raise TrustboError if two bags have different messages of a topic at the same times."""
     both = part.merge(kept, on="time", suffixes=("", "_kept"))
-    equal = (both["data"] == both["data_kept"]).groupby(both["time"]).any()
-    if len(equal) and (~equal).mean() > _SOME:
+    equal = (both["data"] == both["data_kept"]).groupby(both["time"]).any().to_numpy(dtype=bool)
+    if len(equal) and np.mean(~equal) > _SOME:
         topic = part["topic"].iloc[0]
         raise TrustboError(
             f"{first!r} and {name!r} have different messages on {topic} at the same times, so they "
@@ -158,7 +158,7 @@ def without_repeated_statuses(
     if not len(again):
         return statuses
 
-    away = _distance(pd.Series(again), statuses.index.to_numpy())
+    away = _distance(again, statuses.index.to_numpy())
     is_near = away <= _LATE * _NANOSECONDS
     is_same = statuses.to_numpy() == statuses.shift().to_numpy()
     return statuses.loc[~(is_near & is_same)]
@@ -175,9 +175,9 @@ def require_in_order(
         markers: All markers in order.
         ticks: Contact of each `robot`, indexed and sorted by time.
     """
-    numbers = bounds["bound"]
+    numbers = bounds["bound"].to_numpy(dtype=int)
     shown = one_line(markers["bound"].tolist())
-    steps = numbers.diff()
+    steps = np.diff(numbers, prepend=-1)
     falls = (steps < 0) & (numbers > 0)
     if falls.any() or (len(markers) > len(bounds) and _differ_at_once(ticks)):
         raise TrustboError(
@@ -185,14 +185,15 @@ def require_in_order(
             f"or the clocks of several recorders differ; the markers are {shown}. {_REMEDY}"
         )
 
-    if (steps == 0).any():
-        k = int(numbers[steps == 0].iloc[0])
-        cells = bounds.loc[numbers == k, "cell"].drop_duplicates().tolist()
+    again = np.flatnonzero(steps == 0)
+    if len(again):
+        row = int(again[0])
+        cells = bounds["cell"].tolist()[row - 1 : row + 1]
         raise TrustboError(
-            f"bound {k} in {names} is marked with different cells, {one_line(cells[:2])}; send the "
-            "marker of a bound when it begins, and number each bound once."
+            f"bound {numbers[row]} in {names} is marked with different cells, {one_line(cells)}; "
+            "send the marker of a bound when it begins, and number each bound once."
         )
-    if bounds.empty or (numbers != bounds.groupby("mission").cumcount()).any():
+    if bounds.empty or (bounds["bound"] != bounds.groupby("mission").cumcount()).any():
         raise TrustboError(
             f"the bounds in {names} must be marked 0, 1, 2, ... in order; the markers are {shown}. "
             "Record all markers, beginning with bound 0 in the start cell."

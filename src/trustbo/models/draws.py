@@ -20,9 +20,9 @@ class Draws(ABC):
 
     x0_mean: Any
     """Mean of trust before the first bound, shape () or (...,)."""
-    robots: tuple[str, ...] | None
+    robots: Any
     """Names of the robots, in the order of the arrays; None if they are not known."""
-    features: tuple[str, ...] | None
+    features: Any
     """Names of the features, in the order of the arrays; None if they are not known."""
 
     @abstractmethod

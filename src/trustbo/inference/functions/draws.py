@@ -43,8 +43,6 @@ class FunctionDraws(Draws):
         shape: Number of rows and columns of the map; None without a map.
     """
 
-    robots: tuple[str, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
-    features: tuple[str, ...]  # pyright: ignore[reportIncompatibleVariableOverride]
     __slots__ = (
         "_form",
         "_is_flat",
