@@ -2,29 +2,33 @@
 
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
+import llvmlite
+import numba
 from numba import njit
 from numba.core import event
+
+from trustbo.compiled import folder_of, warn_of_no_storage
+
+config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
+_VERSION = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, {version('trustbo')}"
+"""Numba checks the sources of a kernel, but not of the kernels that it calls."""
 
 
 def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return the decorator of a kernel; `options` are further options of `numba.njit`.
 
-    Kernels release the GIL, evaluate 1 / 0 as inf, and are cached on disk. Where no folder for the
-    cache can be written, as in some containers, they are compiled in each process instead.
+    Kernels release the GIL, evaluate 1 / 0 as inf, and are stored on disk; see `compiled`.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:
         made = njit(nogil=True, error_model="numpy", **options)(function)
-        try:
-            made.enable_caching()
-        except RuntimeError:  # numba found no folder
-            _warn_of_no_cache()
+        _store(made)
         return made
 
     return compiled
@@ -38,6 +42,23 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
     no_wrappers: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return njit(nogil=True, error_model="numpy", **no_wrappers, **options)
+
+
+def _store(made: Any) -> None:
+    """Let numba store a kernel in the folder of compiled code, or in the user's NUMBA_CACHE_DIR."""
+    chosen = config.CACHE_DIR
+    folder = Path(chosen) if chosen else folder_of("numba", _VERSION)
+    if folder is None:
+        return
+
+    # Numba reads the setting here, and only here. Kernels of other packages keep their folder.
+    config.CACHE_DIR = str(folder)
+    try:
+        made.enable_caching()
+    except RuntimeError:  # numba found no folder that can be written
+        warn_of_no_storage(folder, "numba cannot write there")
+    finally:
+        config.CACHE_DIR = chosen
 
 
 @contextmanager
@@ -77,14 +98,3 @@ class _CompilerTime(event.Listener):
         self._depth -= 1
         if self._depth == 0:
             self.seconds += time.perf_counter() - self._entered
-
-
-@cache
-def _warn_of_no_cache() -> None:
-    """Warn, once per process, that compiled kernels are not stored."""
-    warnings.warn(
-        "compiled kernels cannot be stored, because neither trustbo's folder nor your home folder "
-        "can be written; they are compiled in each process, which takes about 30 s. Set "
-        "NUMBA_CACHE_DIR to a folder that can be written.",
-        stacklevel=2,
-    )

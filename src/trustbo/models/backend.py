@@ -14,13 +14,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
+from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jaxlib.version
 import numpy as np
+from jax.experimental.compilation_cache import compilation_cache
 from scipy import special
 from scipy.linalg import lapack
+
+from trustbo.compiled import folder_of
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "IProgress not found")
@@ -34,6 +40,15 @@ VERSIONS: dict[str, str] = {
     "jax": jax.__version__,
 }
 """Versions recorded in posteriors, cached because each lookup takes 4 ms."""
+
+_SAFE = 0, 11
+"""First jaxlib whose programs are stored.
+
+Earlier ones crash when they load programs (before 0.10, uwplasma/vmex#142 and #347), or refuse
+programs that the same processor compiled (0.10, jax-ml/jax#38445).
+"""
+_MOST_BYTES = 1_000_000_000
+"""Size of the stored programs beyond which JAX deletes those that were not used for longest."""
 
 
 def library_attrs(sampler: str) -> dict[str, str]:
@@ -116,15 +131,77 @@ def call(prior: Any, method: str, x: jax.Array) -> jax.Array:
     return getattr(prior, method)(x)
 
 
+class _Storage:
+    """Storage of programs in the folder of compiled code, while a thread computes with JAX.
+
+    JAX has one cache for all threads, which has no context manager of its own. Afterwards, JAX is
+    as it was, so that a user's own programs are not stored. If the user has set up JAX's cache, or
+    has switched it off, nothing changes.
+    """
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._n_inside = 0
+        self._before: dict[str, Any] = {}
+
+    def enter(self) -> None:
+        """Set up JAX's cache if no other thread is inside."""
+        with self._lock:
+            if self._n_inside == 0 and jax.config.jax_enable_compilation_cache:
+                folder = None if jax.config.jax_compilation_cache_dir else _folder()
+                if folder is not None:
+                    self._set_up(str(folder))
+            self._n_inside += 1
+
+    def _set_up(self, folder: str) -> None:
+        settings = {
+            "jax_compilation_cache_dir": folder,
+            "jax_compilation_cache_max_size": _MOST_BYTES,  # also makes processes take turns
+            "jax_persistent_cache_min_compile_time_secs": 0.0,
+        }
+        for name, value in settings.items():
+            self._before[name] = getattr(jax.config, name)
+            jax.config.update(name, value)
+
+    def leave(self) -> None:
+        """Restore JAX's settings if no other thread is inside."""
+        with self._lock:
+            self._n_inside -= 1
+            if self._n_inside == 0 and self._before:
+                for name, value in self._before.items():
+                    jax.config.update(name, value)
+                self._before = {}
+                compilation_cache.reset_cache()  # it keeps the folder of its first use otherwise
+
+
+_STORAGE = _Storage()
+
+
+def _folder() -> Path | None:
+    """Return the folder of compiled programs, or None where they cannot be stored."""
+    # Metadata of packages can be stale, so the version is that of the module in use.
+    runtime = jaxlib.version.__version__
+    if tuple(int(part) for part in runtime.split(".")[:2]) < _SAFE:
+        return None
+    return folder_of("jax", f"jax {jax.__version__}, jaxlib {runtime}")
+
+
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Use float64 and the threefry generator, regardless of the caller's JAX flags."""
-    with (
-        jax.enable_x64(True),
-        jax.default_prng_impl("threefry2x32"),
-        jax.threefry_partitionable(True),
-        jax.numpy_rank_promotion("allow"),
-        jax.numpy_dtype_promotion("standard"),
-        jax.transfer_guard("allow"),
-    ):
-        yield
+    """Use float64 and the threefry generator, regardless of the caller's JAX flags.
+
+    Programs that are compiled inside are stored on disk; see `compiled`.
+    """
+    _STORAGE.enter()
+    try:
+        with (
+            jax.enable_x64(True),
+            jax.default_prng_impl("threefry2x32"),
+            jax.threefry_partitionable(True),
+            jax.numpy_rank_promotion("allow"),
+            jax.numpy_dtype_promotion("standard"),
+            jax.transfer_guard("allow"),
+        ):
+            yield
+    finally:
+        _STORAGE.leave()
