@@ -2,7 +2,7 @@
 
 import io
 import sys
-from functools import cache
+import time
 from xml.etree import ElementTree
 
 import numpy as np
@@ -12,7 +12,7 @@ from numba import njit
 
 import trustbo as tb
 from trustbo import display
-from trustbo.display import Summary, compiling
+from trustbo.display import Summary
 from trustbo.hazard.risk import Risk
 from trustbo.models import (
     CoupledTrust,
@@ -95,12 +95,31 @@ def test_a_model_shows_its_effects_and_the_priors_that_it_uses():
     assert "0.7" in repr(HierarchicalTrust(Priors(tau=dist.HalfNormal(0.7))))
 
 
-def test_compiling_is_announced_once(capsys, monkeypatch):
-    monkeypatch.setattr(display, "announce", cache(display.announce.__wrapped__))  # a new process
-    for more in (1, 2):
-        with compiling():
-            njit(lambda x, more=more: x + more)(1)
-    assert capsys.readouterr().err.count("compiling") == 1
+def test_kernels_of_this_package_are_announced_once(capsys):
+    display.say_once.cache_clear()  # a new process
+    for module in ("__main__", "trustbo.workspace", "trustbo.planning"):
+        function = eval("lambda x: x + 1")
+        function.__module__ = module
+        njit(function)(1)
+        assert capsys.readouterr().err.count("kernels") == (module == "trustbo.workspace")
+
+
+def test_slow_work_is_announced_once(capsys, monkeypatch):
+    monkeypatch.setattr(display, "_PATIENCE", 0.02)
+    display.say_once.cache_clear()
+    for seconds in (0.0, 0.2, 0.2):
+        with display.announced("measuring"):
+            time.sleep(seconds)
+    assert capsys.readouterr().err == "measuring\n"
+
+
+def test_a_bar_moves_while_nothing_updates_it(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(sys, "stderr", stream)
+    with display.bar(True, total=2) as shown, display.refreshing(shown):
+        time.sleep(1.5)
+    assert "00:01<" in stream.getvalue()
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])

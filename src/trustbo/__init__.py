@@ -14,4 +14,8 @@ def __getattr__(name: str) -> object:
         from importlib.metadata import version
 
         return version("trustbo")
-    return _getattr(name)
+
+    from trustbo.display import announced
+
+    with announced("Loading libraries (a few seconds)."):
+        return _getattr(name)

@@ -2,9 +2,10 @@
 
 import sys
 import textwrap
+import threading
 import warnings
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -16,7 +17,7 @@ Rows = list[tuple[str, str]]
 """Names and values, with units, of the main properties of an object."""
 _WIDTH = 100
 _MAX_LINES = 3  # per property
-_PATIENCE = 5.0  # seconds of work before a progress bar appears
+_PATIENCE = 2.0  # seconds of work before a progress bar or a line appears
 
 
 class Summary:
@@ -71,7 +72,7 @@ def joined(names: Sequence[str]) -> str:
 
 
 def slow_bar(name: str, unit: str, shown: bool, *, total: int | None = None) -> tqdm:
-    """Make a progress bar that appears only if the work takes longer than 5 seconds."""
+    """Make a progress bar that appears only if the work takes longer than 2 seconds."""
     return bar(shown, desc=name, unit=unit, total=total, delay=_PATIENCE, leave=False)
 
 
@@ -88,24 +89,46 @@ def shows_bars() -> bool:
     return is_notebook or sys.stderr.isatty()
 
 
-def compiling() -> AbstractContextManager[Any]:
-    """Return a context in which the first compilation of a kernel prints a line."""
-    from numba.core import event  # takes most of the time that importing this module would take
+@contextmanager
+def refreshing(shown: tqdm, step: int = 0) -> Iterator[None]:
+    """Update a progress bar by `step` each second, also while compiled code runs."""
+    if shown.disable:
+        yield
+        return
 
-    class Announcement(event.Listener):
-        def on_start(self, event: event.Event) -> None:
-            announce()
+    done = threading.Event()
 
-        def on_end(self, event: event.Event) -> None:
-            pass
+    def refresh() -> None:
+        while not done.wait(1.0):
+            shown.update(step)
+            if not shown.delay:
+                shown.refresh()
 
-    return event.install_listener("numba:compile", Announcement())
+    thread = threading.Thread(target=refresh, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+@contextmanager
+def announced(text: str) -> Iterator[None]:
+    """Print a line if the block takes longer than 2 seconds; each text is printed once."""
+    timer = threading.Timer(_PATIENCE, say_once, [text])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 @cache
-def announce() -> None:
-    """Print that kernels are being compiled, once per process and above any progress bar."""
-    say("compiling kernels (once, about 30 s)")
+def say_once(text: str) -> None:
+    """Print a line to stderr, once per process."""
+    say(text)
 
 
 def say(text: str) -> None:

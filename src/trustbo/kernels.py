@@ -14,6 +14,7 @@ from numba import njit
 from numba.core import event
 
 from trustbo.compiled import folder_of, warn_of_no_storage
+from trustbo.display import say_once
 
 config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
 _VERSION = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, {version('trustbo')}"
@@ -59,6 +60,22 @@ def _store(made: Any) -> None:
         warn_of_no_storage(folder, "numba cannot write there")
     finally:
         config.CACHE_DIR = chosen
+
+
+class _Announcement(event.Listener):
+    """Announces the first compilation of a kernel of this package."""
+
+    def on_start(self, event: event.Event) -> None:
+        details: Any = event.data
+        function = details["dispatcher"].py_func
+        if function.__module__.startswith("trustbo."):
+            say_once("First use: compiling kernels (about 30 s, stored for later).")
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+event.register("numba:compile", _Announcement())
 
 
 @contextmanager

@@ -37,7 +37,7 @@ from trustbo.campaign.stopping import Stop
 from trustbo.campaign.storage import MemoryStorage, Storage
 from trustbo.data import Cell, Mission, path_text
 from trustbo.display import bar as progress_bar
-from trustbo.display import compiling, say
+from trustbo.display import refreshing, say
 from trustbo.errors import (
     TrustboError,
     require_bounds,
@@ -708,7 +708,7 @@ class Campaign(Result):
         state = self.state
         state.stop_reason = "interrupted"
         options = {"total": n_iterations, "initial": len(state.entries), "desc": "missions"}
-        with progress_bar(self._progress, **options) as bar, compiling():
+        with progress_bar(self._progress, **options) as bar, refreshing(bar):
             # Check the rule before each mission: it may already apply when a campaign is resumed.
             while not (reason := self._reason_to_end(n_iterations, stop)):
                 plan = self.ask()

@@ -20,7 +20,7 @@ from trustbo.data import (
     is_line_of_sight,
     require_map,
 )
-from trustbo.display import Rows, Summary, compiling
+from trustbo.display import Rows, Summary, announced
 from trustbo.errors import TrustboError, require_kind, require_list, require_positive
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
@@ -128,7 +128,7 @@ class Workspace(Summary):
             visibility = VISIBILITY if bounds else PAPER_VISIBILITY
             features = {"traversability": TRAVERSABILITY, "visibility": visibility}
 
-        with compiling():
+        with announced("Computing posts, routes and line of sight (minutes on large grids)."):
             # Pixels.
             surface = surface_of(terrain, team.max_slope)
             options = options_of(surface, grid, team, sight)

@@ -5,9 +5,7 @@ function. A campaign, which fits after each mission, therefore compiles it again
 padded data grow. Chains start from draws of the previous posterior, if there is one.
 """
 
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +15,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from numpyro.infer.hmc import hmc
 
-from trustbo.display import slow_bar
+from trustbo.display import announced, refreshing, slow_bar
 from trustbo.errors import TrustboError
 from trustbo.inference.diagnostics import FIELDS
 from trustbo.inference.functions.data import Data, arrays_of
@@ -105,13 +103,18 @@ class Sampler:
             draws: Number of draws per chain.
             accept: Target of the acceptance probability.
             seed: Random seed.
-            progress: Whether to show the elapsed seconds, after 5 seconds.
+            progress: Whether to show the elapsed seconds, after 2 seconds.
             title: Text to show before the elapsed seconds.
 
         Raises:
             TrustboError: If no candidate has a finite density.
         """
-        with own_settings(), slow_bar(title, " s", progress) as bar, ticking(bar):
+        with (
+            own_settings(),
+            announced("Compiling the model and sampling (about 30 s at first use)."),
+            slow_bar(title, " s", progress) as bar,
+            refreshing(bar, step=1),
+        ):
             free = free_shapes(self.model, sites, data)
             unravel = ravel_pytree(free)[1]
             run = self._run_of(free, unravel, warmup, draws, data)
@@ -188,24 +191,6 @@ class Sampler:
                 self._compiled.pop(key, None)
         self._compiled[known] = run
         return run
-
-
-@contextmanager
-def ticking(bar: Any) -> Iterator[None]:
-    """Count seconds in a progress bar while the block runs; compiled code reports no progress."""
-    done = threading.Event()
-
-    def tick() -> None:
-        while not done.wait(1.0):
-            bar.update(1)
-
-    thread = threading.Thread(target=tick, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
 
 
 def free_shapes(model: FunctionModel, sites: Mapping[str, Site], data: Data) -> dict[str, Any]:
