@@ -6,6 +6,8 @@ Multi-robot Bounding Overwatch" (2021). Names are loaded at first use; `__init__
 
 import lazy_loader
 
+import trustbo.forks  # noqa: F401  (notes forks from now on)
+
 _getattr, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 

@@ -27,6 +27,7 @@ from scipy import special
 from scipy.linalg import lapack
 
 from trustbo.compiled import folder_of
+from trustbo.forks import require_threads_of_jax
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", "IProgress not found")
@@ -188,20 +189,32 @@ def _folder() -> Path | None:
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Use float64 and the threefry generator, regardless of the caller's JAX flags.
+    """Context of all computations with JAX; see `own_flags`.
 
-    Programs that are compiled inside are stored on disk; see `compiled`.
+    Programs that are compiled inside are stored on disk; see `compiled`. Raises TrustboError in a
+    forked process, in which JAX would hang.
     """
+    require_threads_of_jax()
     _STORAGE.enter()
     try:
-        with (
-            jax.enable_x64(True),
-            jax.default_prng_impl("threefry2x32"),
-            jax.threefry_partitionable(True),
-            jax.numpy_rank_promotion("allow"),
-            jax.numpy_dtype_promotion("standard"),
-            jax.transfer_guard("allow"),
-        ):
+        with own_flags():
             yield
     finally:
         _STORAGE.leave()
+
+
+@contextmanager
+def own_flags() -> Iterator[None]:
+    """Use float64 and the threefry generator, regardless of the caller's JAX flags.
+
+    This alone is enough to make a distribution that computes nothing, such as a normal one.
+    """
+    with (
+        jax.enable_x64(True),
+        jax.default_prng_impl("threefry2x32"),
+        jax.threefry_partitionable(True),
+        jax.numpy_rank_promotion("allow"),
+        jax.numpy_dtype_promotion("standard"),
+        jax.transfer_guard("allow"),
+    ):
+        yield

@@ -22,7 +22,7 @@ from trustbo.errors import (
     require_positive,
     see,
 )
-from trustbo.models.backend import own_settings
+from trustbo.models.backend import own_flags, own_settings
 from trustbo.models.families import FAMILIES
 from trustbo.models.scores import log_density
 
@@ -42,7 +42,7 @@ _DEFAULTS: dict[str, "Priors"] = {}
 
 def _built(kind: Any, *parameters: float) -> Distribution:
     """Make a float64 distribution on demand, as importing trustbo must not create JAX arrays."""
-    with own_settings():
+    with own_settings():  # the Beta distribution computes
         return kind(*parameters)
 
 
@@ -169,7 +169,7 @@ class Priors(Summary):
 
         n = int(is_sight.sum())
         slope, zero = FAMILIES[family].line_of_sight
-        with own_settings():
+        with own_flags():
             sd = np.where(is_sight, _SIGHT_SD / np.sqrt(n), _FEATURE_SD)
             return replace(
                 default,
@@ -194,7 +194,7 @@ class Priors(Summary):
         """
         require_choice("family", family, FAMILIES)
         slope, zero = FAMILIES[family].line_of_sight
-        with own_settings():
+        with own_flags():
             return replace(
                 cls.default(family),
                 beta=dist.Normal(0.0, slope * _FEATURE_SD),
@@ -220,7 +220,7 @@ class Priors(Summary):
         if beta.batch_shape:
             at = np.array([list(own).index(name) for name in features])
             mean, sd = self.moments("beta")
-            with own_settings():
+            with own_flags():
                 beta = dist.Normal(mean[at], sd[at])
         return replace(self, beta=beta, features=None)
 

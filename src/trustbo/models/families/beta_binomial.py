@@ -11,7 +11,7 @@ import numpyro.distributions as dist
 from numpy.random import Generator
 from scipy import special
 
-from trustbo.models.backend import own_settings, special_functions
+from trustbo.models.backend import own_flags, special_functions
 from trustbo.models.families.family import Array, Drawn, Family, Moments
 from trustbo.models.families.moments import draw_between_knots, log_normal, match_by_nodes
 from trustbo.statespace.matrices import namespace
@@ -33,7 +33,7 @@ class BetaBinomial(Family):
 
     def priors(self) -> dict[str, Any]:
         """See `Family.priors`; wider than the defaults because trust is a logit."""
-        with own_settings():
+        with own_flags():
             return {
                 "beta": dist.Normal(0.0, 2.0),
                 "b": dist.Normal(0.0, 1.0),
