@@ -1,11 +1,14 @@
 """Functions whose posterior would contain the padding, or whose rates are not the data."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from jax import lax
 from numpyro import handlers
+from numpyro.contrib.control_flow import cond, scan
 
 import trustbo as tb
 from trustbo.inference.functions.checks import require_fittable
@@ -275,3 +278,201 @@ def with_correlated_noise(awareness, contact_rate=None, n_ticks=None):
 
 def test_a_covariance_and_unknown_tick_counts_are_accepted(missions):
     check(missions, with_correlated_noise)
+
+
+SCANS = jnp.linspace(0.5, 1.5, 20)
+
+
+def some_scans(index):
+    """Observe the scans with these indices, whose mean is a variable."""
+    level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+    return lambda: numpyro.sample("range", dist.Normal(level, 1.0), obs=SCANS[index])
+
+
+def in_a_plate():
+    with numpyro.plate("scan", 20, subsample_size=5) as index:
+        some_scans(index)()
+
+
+def in_a_scope():
+    with handlers.scope(prefix="lidar"):
+        in_a_plate()
+
+
+def in_nested_plates():
+    level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+    with numpyro.plate("scan", 4, subsample_size=2, dim=-2) as index, numpyro.plate("beam", 5):
+        numpyro.sample("range", dist.Normal(level, 1.0), obs=SCANS.reshape(4, 5)[index])
+
+
+def with_chosen_indices():
+    with handlers.substitute(data={"scan": jnp.arange(5)}):
+        in_a_plate()
+
+
+def in_a_loop():
+    scan(lambda carry, _: (carry, in_a_plate()), 0.0, None, length=2)
+
+
+def in_a_branch():
+    def branch(_):
+        with numpyro.plate("scan", 20, subsample_size=5):
+            numpyro.sample("range", dist.Normal())
+        return 0.0
+
+    cond(True, branch, branch, None)
+
+
+def with_own_key():
+    index = jax.random.choice(numpyro.prng_key(), 20, (5,))
+    some_scans(index)()
+
+
+def beside(part):
+    """A function with a linear drift that also runs `part`."""
+
+    def model(awareness, contact_rate=None):
+        b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+        part()
+        rates(b * awareness[..., 0], contact_rate)
+
+    return model
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    awareness = np.random.default_rng(0).uniform(size=(3, 3, 3, 1))
+    return tb.Workspace.from_awareness(awareness)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        (in_a_plate, "the plate 'scan' .*subsample_size"),
+        (in_a_scope, "the plate 'lidar/scan'"),
+        (in_nested_plates, "the plate 'scan'"),
+        (with_chosen_indices, "the plate 'scan'"),
+        (in_a_loop, "the plate 'scan'"),
+        (in_a_branch, "the plate 'scan'"),
+        (with_own_key, "numpyro.prng_key"),
+    ],
+)
+def test_a_random_subset_of_data_is_refused_before_the_first_mission(workspace, part, message):
+    with pytest.raises(tb.TrustboError, match=message):
+        tb.Campaign(workspace, (2, 0), (0, 2), model=beside(part))
+
+
+def with_whole_plate():
+    with numpyro.plate("scan", 20, subsample_size=20) as index:
+        some_scans(index)()
+
+
+def test_a_plate_that_takes_all_of_its_data_is_accepted(missions):
+    check(missions, beside(with_whole_plate))
+
+
+def of_drift(change):
+    """A function whose drift is b, changed."""
+
+    def model(awareness, contact_rate=None):
+        b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+        rates(change(b) + 0.3 * awareness[..., 0], contact_rate)
+
+    return model
+
+
+def by_while_loop(b):
+    return lax.while_loop(lambda s: s[1] < 3, lambda s: (0.5 * s[0], s[1] + 1), (b, 0))[0]
+
+
+def by_dynamic_loop(b):
+    return lax.fori_loop(0, 2 + (b > 0.0), lambda _, x: 0.5 * x, b)
+
+
+def by_callback(b):
+    return jax.pure_callback(np.tanh, b, b, vmap_method="expand_dims")
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (by_while_loop, "Reverse-mode differentiation does not work"),
+        (by_dynamic_loop, "Reverse-mode differentiation does not work"),
+        (by_callback, "callbacks do not support JVP"),
+    ],
+)
+def test_a_function_without_gradient_is_refused_before_the_first_mission(workspace, change, reason):
+    with pytest.raises(tb.TrustboError, match=f"has no gradient.*{reason}"):
+        tb.Campaign(workspace, (2, 0), (0, 2), model=of_drift(change))
+
+
+def with_gradient(change):
+    """The change, with the gradient of half of its argument."""
+    changed = jax.custom_jvp(change)
+    changed.defjvp(lambda b, slope: (changed(*b), 0.5 * slope[0]))
+    return changed
+
+
+@pytest.mark.parametrize("change", [by_while_loop, by_callback])
+def test_a_function_that_defines_its_gradient_is_accepted(workspace, change):
+    tb.Campaign(workspace, (2, 0), (0, 2), model=of_drift(with_gradient(change)))
+
+
+def test_a_gradient_that_is_not_finite_is_refused(missions):
+    """The square root of 0 has an infinite slope, which is multiplied by 0."""
+    model = of_drift(lambda b: jnp.sqrt(0.0 * b**2))
+    with pytest.raises(tb.TrustboError, match="gradient that is not finite"):
+        tb.fit(missions, model, draws=5, warmup=5, chains=1, check=False, progress=False)
+
+
+def failing(_):
+    raise ValueError("no such survey")
+
+
+def by_failing_callback(b):
+    return with_gradient(lambda b: jax.pure_callback(failing, b, b, vmap_method="expand_dims"))(b)
+
+
+def test_the_reason_of_an_error_in_a_callback_is_quoted(missions):
+    with pytest.raises(tb.TrustboError, match=r"no such survey$"):
+        check(missions, of_drift(by_failing_callback))
+
+
+def with_other_shape_in_a_loop(b):
+    return lax.scan(lambda x, _: (jnp.stack([x, x]), None), b, None, length=2)[0]
+
+
+def test_the_reason_of_an_error_is_quoted_if_its_first_line_announces_it(missions):
+    with pytest.raises(tb.TrustboError, match=r"they differ: .*float64\[2\]"):
+        check(missions, of_drift(with_other_shape_in_a_loop))
+
+
+@pytest.mark.parametrize(
+    "distribution",
+    [dist.Delta(0.1), dist.Delta(0.1).expand([2]).to_event(1), dist.Delta(0.1).mask(True)],
+)
+def test_a_variable_with_a_single_value_is_refused(missions, distribution):
+    with pytest.raises(tb.TrustboError, match=r"the site 'c' .* Delta"):
+        check(missions, beside(lambda: numpyro.sample("c", distribution)))
+
+
+def test_a_site_with_obs_mask_is_refused(missions):
+    known = jnp.arange(20) < 15
+
+    def part():
+        with numpyro.plate("scan", 20):
+            numpyro.sample("range", dist.Normal(1.0, 1.0), obs=SCANS, obs_mask=known)
+
+    with pytest.raises(tb.TrustboError, match=r"the site 'range' .* obs_mask"):
+        check(missions, beside(part))
+
+
+def test_contact_rates_with_obs_mask_are_refused(missions):
+    def model(awareness, contact_rate=None):
+        b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+        law = ContactRate(b * awareness[..., 0], 0.4, 0.05, 0.1)
+        known = jnp.isfinite(contact_rate).all((1, 2))
+        numpyro.sample("contact_rate", law, obs=contact_rate, obs_mask=known)
+
+    with pytest.raises(tb.TrustboError, match=r"the site 'contact_rate' .* obs_mask"):
+        check(missions, model)

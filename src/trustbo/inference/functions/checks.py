@@ -23,6 +23,8 @@ _N_DRAWS = 4
 """Number of draws from the prior for which the function is run."""
 _SEED = 20261127
 """Seed for these draws."""
+_OTHER_SEED = _SEED + 1
+"""Seed with which the function is run again with the same draws."""
 _MISSIONS_PER_PART = 4
 """Number of padded missions for each mission of the part; at least a quarter are not padding."""
 _SAME = 1e-5
@@ -49,8 +51,11 @@ def require_fittable(
     else:
         values = require_unpadded_results(model, data, sites, n_bounds)
 
-    found: Probe = model.over_draws("probe", 2, data)(values, _keys())
+    probe = model.over_draws("probe", 2, data)
+    found: Probe = probe(values, _keys())
     _require_rates_of_data(model, data, found)
+    if not values:  # otherwise, `require_unpadded_results` has checked it
+        _require_same_again(model, found, probe(found.values, _keys(_OTHER_SEED)))
     _require_ticks_of_data(model, data, found)
     _require_symmetric(model, found)
 
@@ -84,8 +89,10 @@ def require_unpadded_results(
 
     values = {name: _extended(v, sites[name].shape) for name, v in wanted.values.items()}
     with_padding = padded(part, np.shape(data[RATES])[:2])
-    found: Probe = model.over_draws("probe", 2, with_padding)(values, _keys())
+    probe = model.over_draws("probe", 2, with_padding)
+    found: Probe = probe(values, _keys())
     _require_rates_of_data(model, with_padding, found)
+    _require_same_again(model, found, probe(values, _keys(_OTHER_SEED)))
     _require_same_rates(model, wanted, found)
     _require_same_densities(model, wanted, found, sites, sites_of_part)
     _require_same_computed(model, wanted, found, list(model.computed_sites(data)))
@@ -105,10 +112,10 @@ def _part_of(data: Data, n_bounds: Sequence[int]) -> dict[str, Any]:
     return {**data, **{name: v[some, :n_driven] for name, v in arrays_of(data).items()}}
 
 
-def _keys() -> Any:
+def _keys(seed: int = _SEED) -> Any:
     """Return the random keys of the draws."""
     with own_settings():
-        return jax.random.split(jax.random.key(_SEED), _N_DRAWS)
+        return jax.random.split(jax.random.key(seed), _N_DRAWS)
 
 
 def _extended(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -129,6 +136,21 @@ def _is_same(wanted: np.ndarray, found: np.ndarray) -> bool:
         return False
     size = np.abs(wanted[np.isfinite(wanted)]).max(initial=0.0)
     return np.allclose(first, wanted, rtol=_SAME, atol=_SAME * size, equal_nan=True)
+
+
+def _require_same_again(model: FunctionModel, found: Probe, again: Probe) -> None:
+    """Raise TrustboError if the densities differ between two runs with the same variables."""
+    pairs = [*zip(found.space, again.space, strict=True)]
+    pairs += zip(found.inputs, again.inputs, strict=True)
+    pairs += [(log_p, again.log_p[name]) for name, log_p in found.log_p.items()]
+    if all(_is_same(a, b) for a, b in pairs if a is not None):
+        return
+
+    raise TrustboError(
+        f"{model.in_short()} draws random numbers that are no variables, for example by "
+        "numpyro.prng_key or subsample_size, which would be the same in the whole fit; draw them "
+        "with numpyro.sample, or use a constant such as jax.random.key(0)."
+    )
 
 
 def _require_same_rates(model: FunctionModel, wanted: Probe, found: Probe) -> None:

@@ -107,6 +107,7 @@ def fit_function(
     if workspace is not None:
         require_plannable(model, workspace)
     require_fittable(model, data, sites, [len(mission.bounds) for mission in missions])
+    _sampler(model).require_gradient(data, sites)
 
     first = _start(model, sites, data, start, chains, seed)
     samples, verdict = _sampled(
@@ -350,18 +351,20 @@ def require_plannable(model: FunctionModel, workspace: Workspace) -> None:
 
 
 def require_learnable(model: FunctionModel, workspace: Workspace) -> None:
-    """Raise TrustboError if the padding would change the posterior of a function.
+    """Raise TrustboError if a function cannot be fitted to any mission of a workspace.
 
-    Before there are missions, the check of `fit_function` is run on an invented mission.
+    Before there are missions, the checks of `fit_function` are run on an invented mission.
     """
-    if model.needs_observations:
-        return
-
     awareness = workspace.awareness.values
     z = np.moveaxis(awareness, 0, -2)  # (move, row, col, robot, feature)
     known = np.argwhere(~np.isnan(z).any((-2, -1)))[:_INVENTED]
     data = data_of_example(z[tuple(known.T)], known, workspace.features)
-    require_unpadded_results(model, data, model.sites(data), [len(known)])
+    if model.needs_observations:
+        data["observations"] = observations_of(data)
+    sites = model.sites(data)
+    _sampler(model).require_gradient(data, sites)
+    if not model.needs_observations:  # its data are not padded
+        require_unpadded_results(model, data, sites, [len(known)])
 
 
 def require_poolable_with_function(

@@ -2,7 +2,6 @@
 
 import inspect
 import json
-import re
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from functools import cached_property
@@ -13,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 from numpyro.distributions import (
+    Delta,
     ExpandedDistribution,
     Independent,
     MaskedDistribution,
+    TransformedDistribution,
     biject_to,
 )
 from numpyro.distributions.distribution import Unit
@@ -25,7 +26,9 @@ from numpyro.primitives import Messenger, sample
 from trustbo.display import joined
 from trustbo.errors import TrustboError
 from trustbo.inference.functions.data import NAMES, RATES, Data, arrays_of
+from trustbo.inference.functions.explain import explained
 from trustbo.inference.functions.identity import constants_of, fingerprint, name_of
+from trustbo.inference.functions.plates import WholePlates
 from trustbo.inference.functions.sites import (
     Site,
     axes_that_differ,
@@ -49,10 +52,10 @@ _HOW = (
 )
 _MOST_KNOWN = 64
 """Number of functions that are remembered, together with their compiled code."""
+_CHANGED = ExpandedDistribution | Independent | MaskedDistribution
+"""Distributions that change the shape or the mask of another one, `base_dist`."""
 _AXES = ("chain", "draw")
 """Names that no variable may have."""
-_OF_SHAPES = re.compile("ncompatible shapes|could not be broadcast|not broadcast")
-"""Errors that JAX and NumPy raise if shapes do not match."""
 
 
 class Found(NamedTuple):
@@ -201,7 +204,8 @@ class FunctionModel:
 
         def run(key: jax.Array, arrays: dict[str, Any]) -> dict[str, Any]:
             inputs = {**data, **arrays}
-            found = handlers.trace(handlers.seed(self.call, key)).get_trace(inputs)
+            whole = WholePlates(self.call, owner=self.in_short())
+            found = handlers.trace(handlers.seed(whole, key)).get_trace(inputs)
             trace.update(found)
             self._require_rates(found, data)
             self._require_sites_again(found, key, inputs)
@@ -210,7 +214,7 @@ class FunctionModel:
                 for name in latent_in(found)
             }
 
-        with own_settings(), _explained(self, data):
+        with own_settings(), explained(self.in_short(), data):
             arrays = arrays_of(data)
             if self.needs_observations:  # its arrays must not be abstract
                 arrays = {}
@@ -269,6 +273,7 @@ class FunctionModel:
 
     def _require_rates(self, trace: Mapping[str, Any], data: Data) -> None:
         """Raise TrustboError unless the site `contact_rate` is the state space of the missions."""
+        self._require_no_obs_mask(trace)
         site = trace.get(RATES)
         if site is None or site["type"] != "sample":
             names = [f"{name!r}" for name, one in trace.items() if one["type"] == "sample"]
@@ -296,14 +301,34 @@ class FunctionModel:
 
         self._require_variables(trace)
 
+    def _require_no_obs_mask(self, trace: Mapping[str, Any]) -> None:
+        """Raise TrustboError for a site with `obs_mask`, which NumPyro splits into two sites.
+
+        Entries that are observed have no density at the second site, so NUTS would not find them.
+        """
+        for name, one in trace.items():
+            parts = [trace.get(f"{name}_{part}") for part in ("observed", "unobserved")]
+            if one["type"] != "deterministic" or None in parts:
+                continue
+
+            remedy = "set values that are to be left out to NaN in the missions"
+            if name != RATES:
+                remedy = (
+                    "leave values out with numpyro.handlers.mask(mask=obs_mask), and sample those "
+                    "that are missing at another site"
+                )
+            raise TrustboError(
+                f"the site {name!r} of {self.in_short()} has an obs_mask, which NumPyro does not "
+                f"support for NUTS; {remedy}."
+            )
+
     def _require_contact_rate(self, rates: Any) -> ContactRate:
         """Return the distribution of the rates; raise TrustboError unless it is a ContactRate."""
         if isinstance(rates, ContactRate):
             return rates
 
         where = f"the site 'contact_rate' of {self.in_short()}"
-        while isinstance(rates, ExpandedDistribution | Independent | MaskedDistribution):
-            rates = rates.base_dist
+        rates = _base_of(rates)
         if isinstance(rates, ContactRate):
             raise TrustboError(
                 f"{where} has a ContactRate that was changed by expand, mask or to_event; give a "
@@ -321,6 +346,12 @@ class FunctionModel:
         for name, one in trace.items():
             free = one["type"] == "sample" and not one["is_observed"]
             named = free or one["type"] == "deterministic"
+            if free and isinstance(_base_of(one["fn"], _CHANGED | TransformedDistribution), Delta):
+                raise TrustboError(
+                    f"the site {name!r} of {self.in_short()} has the distribution Delta, whose "
+                    "single value NUTS cannot sample; use the value itself, and "
+                    "numpyro.deterministic to record it."
+                )
             if free and one["fn"].support.is_discrete:
                 raise TrustboError(
                     f"the site {name!r} of {self.in_short()} is discrete, and NUTS samples "
@@ -478,44 +509,19 @@ class FunctionModel:
 
     def _called(self, compiled: Callable[..., Any], arguments: tuple[Any, ...], data: Data) -> Any:
         """Call a compiled function with the settings and error messages of this module."""
-        with own_settings(), _explained(self, data):
+        with own_settings(), explained(self.in_short(), data):
             return jax.tree.map(np.asarray, compiled(*arguments))
-
-
-class _explained:  # noqa: N801
-    """Context in which the message of an error in a user's function names the function."""
-
-    def __init__(self, model: FunctionModel, data: Data) -> None:
-        self.model = model
-        self.data = data
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        who = self.model.in_short()
-        if isinstance(error, TrustboError):
-            if who not in str(error):
-                raise TrustboError(f"{who}: {error}") from error
-        elif isinstance(error, Exception):
-            text = (str(error).strip().splitlines() or [""])[0]
-            remedy = ""
-            if isinstance(error, NotImplementedError):
-                remedy = " Give variables proper priors, from which NumPyro can draw."
-            if _OF_SHAPES.search(text):
-                remedy = (
-                    f" Awareness has the shape (mission, bound, robot, feature) = "
-                    f"{np.shape(self.data['awareness'])}, and the drift must be (mission, bound, "
-                    "robot). Use a variable of a mission as variable[:, None, None], and one of a "
-                    "robot as it is."
-                )
-            raise TrustboError(
-                f"{who} failed with {type(error).__name__}: {text}{remedy}"
-            ) from error
 
 
 _KNOWN: OrderedDict[str, FunctionModel] = OrderedDict()
 """Models of functions by fingerprint, with the most recently used model last."""
+
+
+def _base_of(distribution: Any, changed: Any = _CHANGED) -> Any:
+    """Return the distribution to which others of the kinds `changed` refer."""
+    while isinstance(distribution, changed):
+        distribution = distribution.base_dist
+    return distribution
 
 
 def as_model(function: Callable[..., Any] | FunctionModel) -> FunctionModel:

@@ -19,6 +19,7 @@ from trustbo.display import announced, refreshing, slow_bar
 from trustbo.errors import TrustboError
 from trustbo.inference.diagnostics import FIELDS
 from trustbo.inference.functions.data import Data, arrays_of
+from trustbo.inference.functions.explain import explained, reason_of
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.inference.functions.sites import Site
 from trustbo.models.backend import own_settings
@@ -74,11 +75,48 @@ class Sampler:
     def __init__(self, model: FunctionModel) -> None:
         self.model = model
         self._compiled: dict[Any, Callable[..., Any]] = {}
+        self._has_gradient = False  # whether it was checked
 
     @property
     def n_compiled(self) -> int:
         """Number of compilations so far."""
         return sum(run._cache_size() for run in self._compiled.values())  # pyright: ignore[reportFunctionMemberAccess]
+
+    def require_gradient(self, data: Data, sites: Mapping[str, Site]) -> None:
+        """Raise TrustboError if JAX cannot differentiate the density of the function.
+
+        The gradient is traced, once for each function, without computing anything.
+        """
+        if self._has_gradient:
+            return
+
+        def slope(z: dict[str, Any], arrays: Data) -> Any:
+            return jax.grad(self.model.potential)(z, self._inputs(data, arrays))
+
+        try:
+            with own_settings():
+                jax.eval_shape(slope, free_shapes(self.model, sites, data), self._arrays(data))
+        except TrustboError:
+            raise
+        except Exception as error:
+            reason = reason_of(error).rstrip(".")
+            raise TrustboError(
+                f"{self.model.in_short()} has no gradient, which NUTS needs: {reason}. Use "
+                "jax.lax.scan for loops, or jax.lax.fori_loop with constant bounds, and define the "
+                "gradient of callbacks with jax.custom_jvp or jax.custom_vjp."
+            ) from error
+        self._has_gradient = True
+
+    def _arrays(self, data: Data) -> dict[str, Any]:
+        """Return the inputs that are arguments of compiled functions."""
+        if self.model.needs_observations:
+            return {}
+        given = arrays_of(data)
+        return {n: jnp.asarray(v) for n, v in given.items() if n in self.model.inputs}
+
+    def _inputs(self, data: Data, arrays: Data) -> Data:
+        """Return all inputs, given those that are arguments of a compiled function."""
+        return data if self.model.needs_observations else {**arrays, "features": data["features"]}
 
     def sample(
         self,
@@ -119,13 +157,11 @@ class Sampler:
             unravel = ravel_pytree(free)[1]
             run = self._run_of(free, unravel, warmup, draws, data)
 
-            arrays = {}
-            if not self.model.needs_observations:
-                given = arrays_of(data)
-                arrays = {n: jnp.asarray(v) for n, v in given.items() if n in self.model.inputs}
+            arrays = self._arrays(data)
             keys = jax.random.split(jax.random.key(seed), len(start.x))
-            found = run(keys, start.x, start.step_size, start.inverse_mass, accept, arrays)
-            x, fields, step_size = jax.tree.map(np.asarray, found)
+            with explained(self.model.in_short(), data):
+                found = run(keys, start.x, start.step_size, start.inverse_mass, accept, arrays)
+                x, fields, step_size, has_slope = jax.tree.map(np.asarray, found)
             z = jax.tree.map(np.asarray, jax.vmap(jax.vmap(unravel))(x))
 
         if not np.isfinite(fields["potential_energy"]).all():
@@ -133,6 +169,12 @@ class Sampler:
                 f"{self.model.in_short()} has no finite density at the starts of the chains. Check "
                 "that delta_w and delta_v are positive and that the drift is finite, also where an "
                 "input such as duration or n_ticks is NaN (jnp.nan_to_num)."
+            )
+        if not has_slope.all():
+            raise TrustboError(
+                f"{self.model.in_short()} has a gradient that is not finite at the starts of the "
+                "chains; check square roots, norms and powers of 0 and inverses of singular "
+                "matrices, also in branches of jnp.where that are not used."
             )
         return Samples(z, fields, float(step_size.mean()))
 
@@ -155,7 +197,7 @@ class Sampler:
         n = sum(int(np.prod(shape)) for _, shape in shapes)
 
         def potential_of(arrays: Data) -> Callable[[Any], Any]:
-            given = data if fixed is not None else {**arrays, "features": features}
+            given = self._inputs(data, arrays)
             return lambda x: self.model.potential(unravel(x), given)
 
         def chain(
@@ -176,6 +218,7 @@ class Sampler:
                 model_args=(arrays,),
                 rng_key=key,
             )
+            has_slope = jnp.isfinite(state.z_grad).all()
 
             def one(state: Any, _: None) -> Any:
                 state = move(state, (arrays,), {})
@@ -183,7 +226,7 @@ class Sampler:
 
             last, (x, fields) = lax.scan(one, state, None, length=warmup + draws)
             kept = {name: values[warmup:] for name, values in fields.items()}
-            return x[warmup:], kept, last.adapt_state.step_size
+            return x[warmup:], kept, last.adapt_state.step_size, has_slope
 
         run = jax.jit(jax.vmap(chain, in_axes=(0, 0, None, None, None, None)))
         if fixed is not None:  # drop the code that was compiled for the data of earlier fits
