@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 
+import arviz as az
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,7 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
+from numpyro import handlers
 from numpyro.handlers import reparam
 from numpyro.infer.reparam import LocScaleReparam
 from numpyro.infer.util import constrain_fn, log_density, potential_energy
@@ -385,6 +387,74 @@ def test_deterministic_sites_are_stored_with_the_axes_of_their_plates(missions, 
         np.testing.assert_allclose(found["cube"], found["lam"] ** 3, rtol=1e-12)
         np.testing.assert_allclose(found["day"], 0.05 * found["z"], rtol=1e-12)
     assert list(fitted["posterior"]["double"]["robot"].values) == ["r1", "r2", "r3"]
+
+
+def labelled(awareness, contact_rate=None):
+    """A function whose axes have names in several ways; there are three robots and two features."""
+    n_robots, n_features = awareness.shape[2:]
+    unit = dist.Normal(0.0, 0.1)
+    weight = numpyro.sample(
+        "weight", unit.expand([n_features]).to_event(1), infer={"event_dims": ["feature"]}
+    )
+    mixing = numpyro.sample(
+        "mixing",
+        unit.expand([n_robots, n_robots]).to_event(2),
+        infer={"event_dims": ["robot", "robot"]},
+    )
+    with handlers.scope(prefix="a"), numpyro.plate("robots", n_robots):
+        offset = numpyro.sample(
+            "offset", unit.expand([3]).to_event(1), infer={"event_dims": ["axis"]}
+        )
+        numpyro.deterministic("turned", offset[:, ::-1])
+    with numpyro.plate("feature", n_features, dim=-2), numpyro.plate("robot", n_robots, dim=-1):
+        first = numpyro.sample("first", unit)
+    with numpyro.plate("robot", n_robots, dim=-2), numpyro.plate("feature", n_features, dim=-1):
+        second = numpyro.sample("second", unit)
+
+    numpyro.deterministic("skill", 2.0 * offset.sum(-1))  # outside of the plate
+    numpyro.deterministic("by_feature", 2.0 * weight)
+    numpyro.deterministic("column", offset[0])  # three entries, which are no robots
+    drift = jnp.einsum("jkif,if->jki", awareness, weight + first.T + second) @ mixing
+    rates = ContactRate(drift + offset.sum(-1), 0.4, 0.05, 0.05)
+    numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+def test_axes_have_the_names_that_the_function_gives_and_the_labels_of_robots(missions):
+    options = {"draws": 4, "warmup": 4, "chains": 1, "check": False, "latent": False}
+    tree = tb.fit(missions, labelled, progress=False, **options)
+    fitted = tree["posterior"].to_dataset()
+    assert {name: fitted[name].dims[2:] for name in fitted} == {
+        "weight": ("feature",),
+        "mixing": ("robot", "robot_"),
+        "a.offset": ("a.robots", "axis"),
+        "a.turned": ("a.robots", "a.turned_dim_1"),
+        "first": ("feature", "robot"),
+        "second": ("second_robot", "second_feature"),
+        "skill": ("robot",),
+        "by_feature": ("feature",),
+        "column": ("column_dim_0",),
+    }
+    robots = ["r1", "r2", "r3"]
+    for dim in ("robot", "robot_", "a.robots", "second_robot"):
+        assert list(fitted[dim].values) == robots
+    assert list(fitted["feature"].values) == list(fitted["second_feature"].values)
+    assert list(fitted["axis"].values) == [0, 1, 2]
+
+    rows = az.summary(tree, var_names=["second"], kind="stats", round_to="none")["mean"]
+    feature = fitted["feature"].values[0]
+    own = fitted["second"].sel(second_robot="r2", second_feature=feature)
+    np.testing.assert_allclose(float(rows[f"second[r2, {feature}]"]), float(own.mean()))
+
+
+def test_more_names_than_axes_are_refused(missions):
+    def model(awareness, contact_rate=None):
+        unit = dist.Normal(0.0, 0.1).expand([2]).to_event(1)
+        weight = numpyro.sample("weight", unit, infer={"event_dims": ["feature", "side"]})
+        rates = ContactRate(awareness @ weight, 0.4, 0.05, 0.05)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    with pytest.raises(tb.TrustboError, match="event_dims"):
+        tb.fit(missions, model, progress=False)
 
 
 def test_features_are_found_by_their_names(workspace):

@@ -703,13 +703,11 @@ def _tree(
         "prior": by_chain(prior, (1, N_PRIOR)),
     }
     shapes = {name: groups["posterior"][safe(name)].shape[2:] for name in stored}
-    sizes = _sizes_of_axes(missions)
-    dims = _dims_of(stored, shapes, sizes)
+    dims = _dims_of(stored, shapes, _sizes_of_axes(missions))
     labels = {
-        dim: np.arange(n)
-        for name in stored
-        for dim, n in zip(dims[safe(name)], shapes[name], strict=True)
-        if dim not in sizes
+        own: _labels_of(dim, n, missions)
+        for name, site in stored.items()
+        for own, dim, n in zip(dims[safe(name)], site.dims, shapes[name], strict=True)
     }
     tree = to_datatree(groups, missions, dims, labels=labels)
     common = [name for name, site in sites.items() if site.mission_axis is None]
@@ -741,8 +739,9 @@ def _dims_of(
 ) -> dict[str, tuple[str, ...]]:
     """Return the names of the axes of variables, by name.
 
-    The suffix `_plate` is added to the name of a plate if it is the name of a variable, or that of
-    an axis of posteriors with a different size.
+    The suffix `_plate` is added to the name of an axis if it is the name of a variable, or that of
+    an axis of posteriors with a different size. The second axis of a variable with the same name
+    has the suffix `_`, as in model classes.
     """
     taken = {"chain", "draw", "bound", *map(safe, sites)}
     known: dict[str, int] = {}
@@ -755,12 +754,42 @@ def _dims_of(
             own = f"{safe(name)}_{own}"
         return own
 
-    return {
-        safe(name): tuple(
-            label(name, dim, n) for dim, n in zip(site.dims, shapes[name], strict=True)
-        )
-        for name, site in sites.items()
-    }
+    named: dict[str, tuple[str, ...]] = {}
+    for name, site in sites.items():
+        own: list[str] = []
+        for dim, n in zip(site.dims, shapes[name], strict=True):
+            one = label(name, dim, n)
+            while one in own:
+                one += "_"
+            own.append(one)
+        named[safe(name)] = tuple(own)
+    return _in_one_order(named)
+
+
+def _in_one_order(dims: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """Return axes with the name of the variable added if their order differs between variables.
+
+    `az.summary` would label the values of such a variable incorrectly; see `tree`.
+    """
+    order: list[str] = []
+    renamed = dict(dims)
+    for name in sorted(dims, key=lambda name: -len(dims[name])):  # that of `to_datatree`
+        seen = [dim for dim in order if dim in dims[name]]
+        n_seen = len(seen)
+        if dims[name][:n_seen] != tuple(seen):
+            renamed[name] = tuple(f"{name}_{dim}" for dim in dims[name])
+        order += [dim for dim in renamed[name] if dim not in order]
+    return renamed
+
+
+def _labels_of(dim: str, n: int, missions: Sequence[Mission]) -> Any:
+    """Return the labels of an axis: names of robots or features, if it has their name and size."""
+    kind = dim.rsplit("/")[-1]  # without the prefixes of `numpyro.handlers.scope`
+    names = {"robot": missions[0].robots, "feature": missions[0].features}
+    for one, of_axis in names.items():
+        if kind in (one, f"{one}s") and n == len(of_axis):
+            return list(of_axis)
+    return np.arange(n)
 
 
 def _sizes_of_axes(missions: Sequence[Mission]) -> dict[str, int]:

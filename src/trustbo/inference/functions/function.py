@@ -168,31 +168,49 @@ class FunctionModel:
 
         self._require_features_in_range(data)
         plates = plates_of_rates(trace)
-        return {name: site_of(trace[name], free[name], plates) for name in free}
+        with explained(self.in_short(), data):
+            return {name: site_of(trace[name], free[name], plates) for name in free}
 
     def computed_sites(self, data: Data) -> dict[str, Site]:
         """Return the sites of `numpyro.deterministic` by name, except those with an axis of bounds.
 
-        The function is traced, without computing anything, on twice as many missions and bounds. An
-        axis whose length changes is the axis of missions or bounds.
+        The function is traced, without computing anything, on twice as many missions, bounds,
+        robots and features. An axis whose length changes is an axis of these.
         """
         trace, _ = self._shapes(data)
         names = [name for name, site in trace.items() if site["type"] == "deterministic"]
         if not names:
             return {}
 
-        try:
-            more_missions, more_bounds = (self._shapes(doubled(data, n))[0] for n in (0, 1))
-        except TrustboError:  # the function accepts only this number of missions and bounds
-            more_missions = more_bounds = trace
+        more_missions, more_bounds, more_robots, more_features = (
+            self._trace_of_more(trace, data, axis) for axis in range(4)
+        )
+        traces = (trace, more_missions, more_robots, more_features)
         plates = plates_of_rates(trace)
         sites = {}
         for name in names:
             if axes_that_differ(trace[name], more_bounds[name]):
                 continue
             axes = axes_that_differ(trace[name], more_missions[name])
-            sites[name] = computed_site(trace, name, plates, axes[0] if axes else None)
+            sites[name] = computed_site(traces, name, plates, axes[0] if axes else None)
         return sites
+
+    def _trace_of_more(self, trace: dict[str, Any], data: Data, axis: int) -> dict[str, Any]:
+        """Trace the function on data doubled along an axis; see `doubled`.
+
+        Return the given trace of the data if the function accepts only their size.
+        """
+        try:
+            more, _ = self._shapes(doubled(data, axis))
+        except TrustboError:
+            return trace
+
+        is_same = all(
+            name in more and np.ndim(more[name]["value"]) == np.ndim(site["value"])
+            for name, site in trace.items()
+            if site["type"] == "deterministic"
+        )
+        return more if is_same else trace
 
     def _shapes(self, data: Data) -> tuple[dict[str, Any], dict[str, Any]]:
         """Trace the function with abstract values.
