@@ -3,6 +3,9 @@
 `benchmarks/field/` has the faults of rasters from public bug reports, one script each.
 """
 
+import os
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -16,6 +19,7 @@ from rasterio import Affine
 from rasterio.control import GroundControlPoint
 from rasterio.enums import ColorInterp
 from rasterio.transform import from_origin
+from worlds import terrain_of
 
 from trustbo.errors import TrustboError
 from trustbo.terrain import pixel_size, read_terrain
@@ -668,3 +672,37 @@ def test_real_terrain_is_read_in_metres(name, real_terrain):
     assert terrain.rio.crs.is_projected
     assert all(0.4 < side < 1.1 for side in pixel_size(terrain))
     assert (terrain["dsm"] >= terrain["dem"]).where(terrain["dem"].notnull(), True).all()
+
+
+READERS = """
+import warnings
+warnings.simplefilter("ignore")
+import rioxarray, sys, xarray
+import trustbo as tb
+from trustbo.workspace.grid import Grid
+
+terrain = xarray.open_dataset(sys.argv[1], decode_coords="all")
+grid = Grid((2, 2), 0.0, 60.0, 30.0, 30.0, crs="EPSG:32633")
+maps = xarray.Dataset({"trust": (("row", "col"), [[0.0, 1.0], [2.0, 3.0]])})
+for read in (
+    lambda: tb.terrain.read_terrain("dem.tif"),
+    lambda: tb.terrain.synthetic_terrain((60.0, 60.0)),
+    lambda: tb.Workspace.from_terrain(terrain, (2, 2)),
+    lambda: grid.place(maps),
+):
+    try:
+        read()
+        print("read")
+    except tb.TrustboError as error:
+        print("PROJ_DATA" in str(error) and "PROJ_LIB" in str(error))
+"""
+
+
+def test_data_of_another_proj_is_named(tmp_path):
+    terrain_of(np.ones((60, 60))).to_netcdf(tmp_path / "terrain.nc")
+    other = {"PROJ_LIB": str(tmp_path)}  # a folder without PROJ's database, as of another version
+    command = [sys.executable, "-c", READERS, str(tmp_path / "terrain.nc")]
+    done = subprocess.run(
+        command, env=os.environ | other, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["True"] * 4, done.stderr

@@ -7,6 +7,7 @@ import xarray as xr
 from scipy import ndimage
 
 from trustbo.errors import TrustboError, require_positive, require_tuple, require_whole
+from trustbo.terrain.place import require_proj
 from trustbo.terrain.read import check_size, read_terrain
 
 _FOLDER = Path(__file__).parent / "data" / "wellington"
@@ -93,6 +94,7 @@ def synthetic_terrain(
     height = 6.0 * np.exp(0.5 * crowns / crowns.std() - 0.125)
     dsm = dem + np.where(wooded, height, 0.0)
 
+    require_proj()
     y = _ORIGIN[1] - (np.arange(shape[0]) + 0.5) * resolution
     x = _ORIGIN[0] + (np.arange(shape[1]) + 0.5) * resolution
     maps = (xr.DataArray(z, {"y": y, "x": x}, ("y", "x")) for z in (dem, dsm))

@@ -14,7 +14,7 @@ from scipy.spatial import QhullError
 from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.files import FilePath
 from trustbo.terrain.heights import HIGHEST, LOWEST
-from trustbo.terrain.place import require_map, vertical_axis
+from trustbo.terrain.place import require_map, require_proj, vertical_axis
 from trustbo.terrain.read import check_size, require_terrain
 
 _GROUND_GAP = 10.0
@@ -53,6 +53,7 @@ def read_lidar(points: FilePath, resolution: float = 1.0, *, crs: object = None)
     step = require_positive("resolution", resolution)
     remedy = "give the path of one file; merge tiles first, e.g. with pdal merge"
     path = expanduser(require_kind("points", points, str | PathLike, remedy))
+    require_proj()
     xyz, is_ground, own = _read_points(path, crs)
 
     # Pixels are counted from the upper left; points on an edge are in the pixel south or east.

@@ -1,15 +1,18 @@
 """Georeferencing: CRS of rasters, and warping to metric maps with north at the top."""
 
+import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import rasterio.crs
 import xarray as xr
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 from rasterio.enums import Resampling
+from rasterio.errors import CRSError as RasterioCRSError
 
 from trustbo.errors import TrustboError
 
@@ -18,6 +21,29 @@ _DISTORTION = 0.01  # relative error of lengths from which a map is warped
 _SMALLEST = 0.01  # m; smaller pixels of a map are in degrees
 _DEGREE = 111_320.0  # m: length of a degree of latitude
 _STEP = 100.0  # m; distance over which a map's directions and lengths are measured
+
+
+_OF_PROJ = ("PROJ_DATA", "PROJ_LIB")
+"""Environment variables that replace the data of PROJ."""
+
+
+def require_proj() -> None:
+    """Check that rasterio and pyproj find PROJ's database, without which they know no CRS.
+
+    Call this function before either makes a CRS. Raises TrustboError if they do not, which is
+    usual if QGIS, ROS or conda has set the folder of another version of PROJ.
+    """
+    try:
+        rasterio.crs.CRS.from_epsg(4326)
+        CRS.from_epsg(4326)
+    except (RasterioCRSError, CRSError) as error:
+        given = [f"{name}={os.environ[name]!r}" for name in _OF_PROJ if name in os.environ]
+        reason = " ".join(str(error).split())
+        raise TrustboError(
+            "the database of PROJ, which defines coordinate reference systems, cannot be used: "
+            f"{reason}. Unset the environment variables PROJ_DATA and PROJ_LIB (now "
+            f"{', '.join(given) or 'neither is set'}), or reinstall rasterio and pyproj."
+        ) from None
 
 
 @contextmanager

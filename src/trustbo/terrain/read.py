@@ -33,6 +33,7 @@ from trustbo.terrain.place import (
     placed,
     quiet_affine,
     require_map,
+    require_proj,
     same_grid,
     vertical_axis,
 )
@@ -98,6 +99,7 @@ def read_terrain(
     Example:
         >>> terrain = tb.terrain.read_terrain("dem.tif", "dsm.tif", resolution=1.0)
     """
+    require_proj()
     stored = [_stored(dem, "dem")]
     if dsm is not None:
         stored.append(_stored(dsm, "dsm"))
@@ -154,6 +156,7 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
     if not {"dem", "dsm"} <= {*require_kind("terrain", terrain, xr.Dataset, remedy)}:
         raise TrustboError(f"the terrain has {', '.join(map(str, terrain))}; {remedy}.")
 
+    require_proj()
     # The variable with the CRS is not a coordinate in a file that was opened by xarray.
     names = {terrain[name].attrs.get("grid_mapping", "spatial_ref") for name in ("dem", "dsm")}
     terrain = terrain.set_coords([name for name in names if name in terrain.variables])

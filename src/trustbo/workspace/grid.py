@@ -17,11 +17,11 @@ from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, one_line, require_pair
 from trustbo.terrain.pixels import index_within, order_along, row_and_col
-from trustbo.terrain.place import converted, quiet_affine
+from trustbo.terrain.place import converted, quiet_affine, require_proj
 
 type Location = Cell | Mapping[str, float]
 """A cell (row, col), or a position with named coordinates; see `Grid.locate`."""
-WGS84 = CRS.from_epsg(4326)
+WGS84 = "EPSG:4326"
 MAX_MISSING = 0.5
 """Maximum fraction of a passable cell's pixels that may be missing or too steep."""
 
@@ -222,6 +222,7 @@ class Grid(Summary):
             placed[axis].attrs = {"axis": axis.upper(), "units": "m"}
 
         if self.crs is not None:
+            require_proj()
             placed = placed.rio.write_crs(self.crs)
 
         step = self.cell_width, self.cell_height
