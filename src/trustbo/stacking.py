@@ -1,11 +1,11 @@
 """Checks of missions that are to be fitted together."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, one_line, warn
+from trustbo.errors import TrustboError, require_list, require_order, warn
 
 
 def known_awareness(missions: Sequence[Mission]) -> list[int]:
@@ -47,20 +47,33 @@ def require_same_robots(what: str, missions: Sequence[Mission], robots: Sequence
             )
 
 
-def require_same_team(missions: Sequence[Mission]) -> None:
-    """Raise TrustboError unless there are missions, all with the same robots and features."""
-    if not isinstance(missions, Sequence) or not missions:
-        raise TrustboError(
-            f"missions must be a list of at least one mission; got {one_line(missions)}. For a "
-            "single mission, give [mission]; for a result or a campaign, give its .missions."
-        )
+def list_of_missions(missions: Iterable[Mission], what: str = "missions") -> list[Mission]:
+    """Return missions as a new list, which may be empty.
+
+    Any iterable with an order is accepted, such as a tuple, a Series, an array of objects or a
+    generator. Raises TrustboError for other values, such as a single mission.
+    """
+    remedy = (
+        "give a list of missions; for a single mission, [mission]; for a result or a campaign, its "
+        ".missions; for a dict, its .values()"
+    )
+    return require_list(what, require_order(what, missions), Mission, remedy)
+
+
+def require_same_team(missions: Iterable[Mission]) -> list[Mission]:
+    """Return missions as a list; see `list_of_missions`.
+
+    Raises TrustboError unless there are missions, all with the same robots and features.
+    """
+    missions = list_of_missions(missions)
+    if not missions:
+        raise TrustboError("missions must contain at least one mission; got none.")
 
     first = missions[0]
     for j, mission in enumerate(missions):
-        if not isinstance(mission, Mission):
-            raise TrustboError(f"mission {j} is not a Mission; got {one_line(mission)}.")
         if (mission.robots, mission.features) != (first.robots, first.features):
             raise TrustboError(
                 f"mission {j} has robots {mission.robots} and features {mission.features}, but "
                 f"mission 0 has {first.robots} and {first.features}; all must agree."
             )
+    return missions

@@ -1,6 +1,6 @@
 """Check a fitted model for problems in its posterior and its predictions."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -22,6 +22,7 @@ from trustbo.inference.place_maps import of_workspace
 from trustbo.inference.score import Posteriors, last_posterior, predictions, score
 from trustbo.models.families import FAMILIES
 from trustbo.parallel import computing
+from trustbo.stacking import list_of_missions
 
 SIZE = 0.1
 """Smallest effect on contact that is considered large enough to change a plan."""
@@ -87,7 +88,7 @@ class Finding(NamedTuple):
 @computing()
 def check(
     posterior: xr.DataTree | Sequence[xr.DataTree | None] | HasPosteriors,
-    missions: Sequence[Mission] | None = None,
+    missions: Iterable[Mission] | None = None,
 ) -> Check:
     """Check a fitted model of contact rates for possible problems.
 
@@ -131,12 +132,13 @@ def check(
             "trustbo.inference.predict_reports instead."
         )
 
+    given = None if missions is None else list_of_missions(missions)
     robots = effects_of_robots(tree)
     findings = {
         "robots": _check_robots(robots),
         "places": _check_places(tree),
         "weights": _check_weights(tree),
-        "coverage": _check_coverage(trees, tree, missions),
+        "coverage": _check_coverage(trees, tree, given),
     }
 
     table = pd.DataFrame(list(findings.values()), pd.Index(findings, name="check"))
@@ -293,7 +295,7 @@ def _weights(posterior: xr.DataTree, group: str, name: str) -> np.ndarray:
 
 
 def _check_coverage(
-    trees: Sequence[xr.DataTree | None], last: xr.DataTree, missions: Sequence[Mission] | None
+    trees: Sequence[xr.DataTree | None], last: xr.DataTree, missions: list[Mission] | None
 ) -> Finding:
     """Check whether 90 % intervals one mission ahead contain 90 % of the rates."""
     if len(trees) < 2:

@@ -15,7 +15,7 @@ imputation; Kong, Liu and Wong 1994), and the weights are corrected for the join
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -23,12 +23,13 @@ import xarray as xr
 from scipy import special, stats
 
 from trustbo.data import Cell, Mission, require_map
-from trustbo.errors import PosteriorError, TrustboError, require_list, require_whole
+from trustbo.errors import PosteriorError, TrustboError, require_whole
 from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, TILT, BoundPrior, Hazard
 from trustbo.hazard.risk import BoundRisk, add_lost
 from trustbo.hazard.trials import LostMission, Trials
 from trustbo.inference import importance
 from trustbo.parallel import computing
+from trustbo.stacking import list_of_missions
 from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import Difficulty, difficulty_of
 from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES
@@ -57,11 +58,11 @@ _MAPS = "move", "row", "col", "next_move"
 
 @computing()
 def fit_hazard(
-    missions: Sequence[Mission],
+    missions: Iterable[Mission],
     workspace: Workspace,
     hazard: Hazard | None = None,
     *,
-    lost: Sequence[LostMission] = (),
+    lost: Iterable[LostMission] = (),
     goal: Cell | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
@@ -99,7 +100,7 @@ def fit_hazard(
     """
     started = time.perf_counter()
     hazard = hazard or Hazard()
-    missions = require_list("missions", missions, Mission, "give a list of missions")
+    missions = list_of_missions(missions)
     require_map("the hazard model", missions)
     for j, mission in enumerate(missions):
         if mission.map:

@@ -5,13 +5,14 @@ counted with their next moves. If robots turned back after a failure, or the log
 path does not show the next move that was planned. Such a trial is shared equally by all next moves.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import NamedTuple, Self
 
 import numpy as np
 
 from trustbo.data import Cell, Mission
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_list
+from trustbo.stacking import list_of_missions
 from trustbo.workspace.moves import END, bounds_and_next
 
 CAUSES = ("stuck", "tipped", "timeout", "collision", "lost_contact")
@@ -55,8 +56,8 @@ class Trials(NamedTuple):
     @classmethod
     def from_missions(
         cls,
-        missions: Sequence[Mission],
-        lost: Sequence[LostMission] = (),
+        missions: Iterable[Mission],
+        lost: Iterable[LostMission] = (),
         goal: Cell | None = None,
     ) -> Self:
         """Count the trials in measured missions and in lost missions.
@@ -74,7 +75,8 @@ class Trials(NamedTuple):
         Raises:
             TrustboError: If a path skips cells or does not enter `where`.
         """
-        known = [_reported(mission, goal) for mission in missions]
+        lost = require_list("lost", lost, LostMission, "give a list of LostMission")
+        known = [_reported(mission, goal) for mission in list_of_missions(missions)]
         known += [_located(mission) for mission in lost if mission.where is not None]
         unknown = [bounds_and_next(mission.path) for mission in lost if mission.where is None]
 

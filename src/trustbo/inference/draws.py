@@ -1,7 +1,7 @@
 """Read parameters, missions and models from a posterior."""
 
 import json
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -414,7 +414,7 @@ def model_of(posterior: xr.DataTree) -> TrustModel:
 
 def read_posterior(
     posterior: xr.DataTree,
-    missions: Sequence[Mission] | None = None,
+    missions: Iterable[Mission] | None = None,
     *,
     model: TrustModel | None = None,
 ) -> tuple[Density, JointDraws]:
@@ -430,8 +430,7 @@ def read_posterior(
         TrustboError: If the posterior contains no data and no missions are given, a custom model is
             not given, or a different model is given.
     """
-    missions = missions_of(posterior) if missions is None else missions
-    require_same_team(missions)
+    missions = require_same_team(missions_of(posterior) if missions is None else missions)
     features = missions[0].features
     posterior = in_order_of(posterior, missions[0].robots, features)
 
@@ -447,13 +446,13 @@ def read_posterior(
     return fitted, draws_of(fitted, groups)
 
 
-def in_order_of_features(missions: Sequence[Mission], posterior: xr.DataTree) -> list[Mission]:
+def in_order_of_features(missions: Iterable[Mission], posterior: xr.DataTree) -> list[Mission]:
     """Return missions with their features in the order of a posterior.
 
     The order of the robots changes only for a posterior of a function. Raises TrustboError if the
     missions disagree or their names differ from those of the posterior.
     """
-    require_same_team(missions)
+    missions = require_same_team(missions)
     features = names_in(posterior, "feature") or missions[0].features
     robots = missions[0].robots
     if is_by_position(posterior):

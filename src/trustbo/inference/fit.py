@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -48,7 +48,13 @@ from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_to_record
 from trustbo.models.visited import has_places
 from trustbo.parallel import computing
-from trustbo.stacking import known_awareness, pooled, require_same_robots, require_same_team
+from trustbo.stacking import (
+    known_awareness,
+    list_of_missions,
+    pooled,
+    require_same_robots,
+    require_same_team,
+)
 from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
@@ -68,10 +74,10 @@ _MANY_SCORES = 12
 @Renamed(whole="latent")
 @computing()
 def fit(
-    missions: Sequence[Mission],
+    missions: Iterable[Mission],
     model: TrustModel | Callable[..., Any] | None = None,
     *,
-    earlier: Sequence[Mission] = (),
+    earlier: Iterable[Mission] = (),
     sampler: str | None = None,
     workspace: Workspace | None = None,
     draws: int = 1000,
@@ -142,7 +148,8 @@ def fit(
         >>> az.summary(posterior)
     """
     started = time.perf_counter()
-    missions, robots = _joined(missions, earlier, workspace)
+    earlier = list_of_missions(earlier, "earlier")
+    missions, robots = _joined(list_of_missions(missions), earlier, workspace)
     if start is not None:
         start = as_fitted("start", start)
         same_robots = names_in(start, "robot") in ((), missions[0].robots)
@@ -220,8 +227,8 @@ def require_poolable_with_model(
 
 
 def _joined(
-    missions: Sequence[Mission], earlier: Sequence[Mission], workspace: Workspace | None
-) -> tuple[Sequence[Mission], tuple[str, ...]]:
+    missions: list[Mission], earlier: list[Mission], workspace: Workspace | None
+) -> tuple[list[Mission], tuple[str, ...]]:
     """Return all missions, earlier ones first, and the robots of those that are not earlier."""
     if missions or not earlier:
         require_same_team(missions)

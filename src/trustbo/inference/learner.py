@@ -5,7 +5,7 @@ module distinguishes them.
 """
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ClassVar, Protocol
 
 import xarray as xr
@@ -414,7 +414,7 @@ def expected_and_drawn(
 @computing()
 def add_latent(
     posterior: xr.DataTree,
-    missions: Sequence[Mission] | None = None,
+    missions: Iterable[Mission] | None = None,
     *,
     model: Model | None = None,
     progress: bool = True,

@@ -1,6 +1,6 @@
 """Predictions of people's reports from a posterior of `HumanTrust`."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ _FINE = 1e6
 @computing()
 def predict_reports(
     posterior: xr.DataTree,
-    missions: Sequence[Mission],
+    missions: Iterable[Mission],
     *,
     given: str = "earlier",
     fitted: bool = False,
@@ -78,7 +78,7 @@ def predict_reports(
             "predict_reports needs a posterior of HumanTrust; got a posterior of "
             f"{posterior.attrs.get('model')}. Use trustbo.inference.score for contact rates."
         )
-    require_same_team(missions)
+    missions = require_same_team(missions)
     require_choice("given", given, ("earlier", "none"))
     seed = require_whole("seed", seed, 0)
     n_draws = require_count("n_draws", n_draws)

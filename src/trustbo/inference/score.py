@@ -6,12 +6,12 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_kind, require_list, require_whole
+from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.inference.draws import QUANTILES, as_fitted, in_order_of
 from trustbo.inference.filter import TrustFilter
 from trustbo.models.observations import Observations, require_ticks
 from trustbo.parallel import computing
-from trustbo.stacking import known_awareness
+from trustbo.stacking import known_awareness, list_of_missions
 from trustbo.statespace import kalman
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
@@ -29,11 +29,11 @@ class Posteriors(list[xr.DataTree | None]):
     """
 
     def __init__(
-        self, posteriors: Iterable[xr.DataTree | None], missions: Sequence[Mission]
+        self, posteriors: Iterable[xr.DataTree | None], missions: Iterable[Mission]
     ) -> None:
         """Store the missions and the posteriors, which are None where there was none yet."""
         super().__init__(posteriors)
-        self.missions = list(missions)
+        self.missions = list_of_missions(missions)
 
     def __repr__(self) -> str:
         n_learned = sum(tree is not None for tree in self)
@@ -43,7 +43,7 @@ class Posteriors(list[xr.DataTree | None]):
 @computing()
 def score(
     posterior: xr.DataTree | Sequence[xr.DataTree | None],
-    missions: Sequence[Mission] | None = None,
+    missions: Iterable[Mission] | None = None,
     *,
     workspace: Workspace | None = None,
     seed: int = 0,
@@ -83,7 +83,7 @@ def score(
     require_whole("seed", seed, 0)
     if missions is None and isinstance(posterior, Posteriors):
         missions = posterior.missions
-    missions = require_list("missions", missions, Mission, "give a list of missions")
+    missions = list_of_missions(() if missions is None else missions)
 
     known = range(len(missions))
     if workspace is not None:

@@ -1,6 +1,6 @@
 """Missions in netCDF files, stored as consecutive bounds with the ticks of the robots."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from typing import Any
 
@@ -89,7 +89,7 @@ def _seal_of(content: bytes) -> bytes:
     return _SEAL + hash_of(content).encode()
 
 
-def write_missions(path: FilePath, missions: Sequence[Mission]) -> None:
+def write_missions(path: FilePath, missions: Iterable[Mission]) -> None:
     """Write missions with the same robots and features to a netCDF file.
 
     The poses and contacts of bounds that have both are included.
@@ -129,13 +129,13 @@ def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
     return missions
 
 
-def missions_to_tree(missions: Sequence[Mission]) -> xr.DataTree:
+def missions_to_tree(missions: Iterable[Mission]) -> xr.DataTree:
     """Convert missions to a tree; see `write_missions`.
 
     Raises:
         TrustboError: The robots or features differ between missions.
     """
-    require_same_team(missions)
+    missions = require_same_team(missions)
     bounds = [bound for mission in missions for bound in mission.bounds]
     ticks = [_ticks(bound) for bound in bounds]
     poses, contacts = (np.concatenate(values) for values in zip(*ticks, strict=True))

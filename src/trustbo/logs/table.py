@@ -1,6 +1,6 @@
 """Missions as tables in long form, with one row per mission, bound and robot."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ _LAST_BITS = 1e-12
 """Differences of rates that are not due to rounded decimals."""
 
 
-def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
+def to_frame(missions: Iterable[Mission]) -> pd.DataFrame:
     """Return a table of missions, numbered from 1, without ticks.
 
     The table has the columns of `read_table`; `to_csv(file, index=False)` writes it to a file.
@@ -43,7 +43,7 @@ def to_frame(missions: Sequence[Mission]) -> pd.DataFrame:
     Example:
         >>> tb.logs.to_frame(missions).to_csv("log.csv", index=False)
     """
-    require_same_team(missions)
+    missions = require_same_team(missions)
     taken = {folded(name) for name in (*COLUMNS, *TRUST, *_NO_FEATURES)}
     bad = [name for name in missions[0].features if folded(name) in taken]
     if bad:

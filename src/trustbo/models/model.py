@@ -1,7 +1,7 @@
 """Base class of trust models: priors, a state-space form, and a NumPyro program."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
@@ -22,6 +22,7 @@ from trustbo.models.families import FAMILIES, Family
 from trustbo.models.observations import Observations, require_ticks
 from trustbo.models.priors import Priors, as_text
 from trustbo.models.scores import NormalScores
+from trustbo.stacking import list_of_missions
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.statespace.blocks import Layout, LinearPredictor
 from trustbo.statespace.matrices import namespace
@@ -217,7 +218,7 @@ class TrustModel(Summary, ABC):
         return {name: (name, parameters[name]) for name in ("beta", "b")}
 
     def observations(
-        self, missions: Sequence[Mission], workspace: Workspace | None = None
+        self, missions: Iterable[Mission], workspace: Workspace | None = None
     ) -> Observations:
         """Collect the rates and features of missions, and the data that the effects need.
 
@@ -226,6 +227,7 @@ class TrustModel(Summary, ABC):
                 awareness value is NaN; a measured rate lacks the n_ticks that the family needs; or
                 a path jumps or leaves the workspace.
         """
+        missions = list_of_missions(missions)
         observations = Observations.from_missions(missions)
         require_ticks(self.likelihood, observations.contact_rate, observations.n_ticks)
         for effect in self.effects:

@@ -1,6 +1,6 @@
 """Contact rates and awareness of missions, padded to one array each."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -35,14 +35,14 @@ class Observations(NamedTuple):
     """Places of the bounds, or None if no effect needs them."""
 
     @classmethod
-    def from_missions(cls, missions: Sequence[Mission]) -> Self:
+    def from_missions(cls, missions: Iterable[Mission]) -> Self:
         """Pad missions with the same robots and features, of any length.
 
         Raises:
             TrustboError: If there are no missions, robots or features differ between missions, or
                 an awareness value is NaN; only contact rates may be missing.
         """
-        require_same_team(missions)
+        missions = require_same_team(missions)
         n_bounds = max(len(mission.bounds) for mission in missions)
         _, n_robots, n_features = missions[0].awareness.shape
         shape = len(missions), n_bounds, n_robots

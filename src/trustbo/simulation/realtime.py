@@ -5,15 +5,16 @@ The robot estimates traversability from its motion, and visibility from the retu
 The inputs are means over the ticks of a bound in which the robot moves.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from trustbo.data import Bound, Cell, Mission
-from trustbo.errors import TrustboError, require_kind, require_list, require_whole
+from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.simulation.kinematic import KinematicSimulator
 from trustbo.simulation.protocol import DescribedSimulator, digest
 from trustbo.simulation.world import World
+from trustbo.stacking import list_of_missions
 from trustbo.team import Robot
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace.moves import cells_ahead
@@ -58,7 +59,7 @@ class RealtimeAwareness(DescribedSimulator):
     def __init__(
         self,
         simulator: KinematicSimulator,
-        missions: Sequence[Mission] | None = None,
+        missions: Iterable[Mission] | None = None,
         *,
         seed: int = 0,
     ) -> None:
@@ -87,8 +88,7 @@ class RealtimeAwareness(DescribedSimulator):
         if missions is None:
             missions = _random_missions(simulator, require_whole("seed", seed, 0))
         else:
-            remedy = "give a list of missions"
-            missions = require_list("missions", missions, Mission, remedy)
+            missions = list_of_missions(missions)
 
         samples = [self.inputs(bound) for mission in missions for bound in mission.bounds]
         n = len(samples) * self.workspace.team.n_robots

@@ -1,10 +1,11 @@
 """Simulator that replays recorded missions."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from trustbo.data import Cell, Mission, path_text, require_map
-from trustbo.errors import TrustboError, require_cells, require_list, require_whole
+from trustbo.errors import TrustboError, require_cells, require_whole
 from trustbo.simulation.protocol import DescribedSimulator
+from trustbo.stacking import list_of_missions
 
 
 class ReplaySimulator(DescribedSimulator):
@@ -21,7 +22,7 @@ class ReplaySimulator(DescribedSimulator):
         >>> again = tb.iterate(workspace, (9, 0), (0, 9), n_iterations=2, simulator=replay)
     """
 
-    def __init__(self, missions: Sequence[Mission], *, any_path: bool = False) -> None:
+    def __init__(self, missions: Iterable[Mission], *, any_path: bool = False) -> None:
         """Store the missions.
 
         Args:
@@ -31,7 +32,7 @@ class ReplaySimulator(DescribedSimulator):
         Raises:
             TrustboError: There are no missions, or they have no map.
         """
-        missions = require_list("missions", missions, Mission, "give a list of missions")
+        missions = list_of_missions(missions)
         if not missions:
             raise TrustboError("missions must contain at least one mission; got none.")
         require_map("a replay", missions)
