@@ -6,7 +6,8 @@ OpenBLAS, NumPy, Numba and XLA select instructions for the processor, so the las
 differ between processors. A setting makes one of these libraries compute as on another processor.
 Settings that this processor or build does not support are skipped and listed. Each run of the tests
 combines one setting of each library; with `--each`, every setting has its own run. Without
-arguments of pytest, a run is the same as `make test`. Numba and JAX cache kernels per setting.
+arguments of pytest, a run is the same as `make test`. Compiled code is stored per setting: the
+script ends with an error if two settings that compile differently share a folder.
 """
 
 import os
@@ -25,6 +26,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PYTEST = [sys.executable, "-m", "pytest", "-q", "--numprocesses", "2", "--dist", "worksteal"]
 NOT_OPTIMISED = "--xla_backend_optimization_level=0"
 """Flag that makes XLA compile faster."""
+
+CACHE = "TRUSTBO_CACHE"
+"""Variable with the folder of compiled code."""
+COMPILERS = "NUMBA_CPU_NAME", "XLA_FLAGS"
+"""Variables of settings that change compiled code."""
 
 DISPATCHED = [name for name in __cpu_dispatch__ if __cpu_features__[name]]
 """Features of this processor that NumPy uses and that can be disabled."""
@@ -89,6 +95,15 @@ def settings_by_library() -> list[list[Setting]]:
     ]
 
 
+def folder_of(settings: list[Setting]) -> str:
+    """Return the name of the folder in which code is stored under these settings."""
+    code = "from trustbo.compiled import folder_of; print(folder_of('jax', '0').name)"
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {s.variable: s.value for s in settings} | {CACHE: folder}
+        command = [sys.executable, "-c", code]
+        return subprocess.check_output(command, env=environment, text=True).strip()
+
+
 def outcome(case: ElementTree.Element) -> str:
     """Return whether a test passed, failed or was skipped."""
     tags = {child.tag for child in case}
@@ -101,7 +116,10 @@ def run(settings: list[Setting], arguments: list[str]) -> tuple[Counter[str], li
     """Run the tests once; return the number of tests by outcome, and the names of failed tests."""
     print(f"\n=== {', '.join(map(str, settings)) or 'this processor'}", flush=True)
     environment = (
-        os.environ | {"XLA_FLAGS": NOT_OPTIMISED} | {s.variable: s.value for s in settings}
+        os.environ
+        # Programs are stored as for users, not in the cache of JAX that conftest.py would set up.
+        | {"XLA_FLAGS": NOT_OPTIMISED, "JAX_COMPILATION_CACHE_DIR": "", CACHE: str(ROOT / ".cache")}
+        | {s.variable: s.value for s in settings}
     )
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
@@ -123,6 +141,12 @@ def main() -> None:
         passes = [[setting] for library in here for setting in library]
     else:
         passes = [[setting for setting in row if setting] for row in zip_longest(*here)]
+
+    compilers = [s for row in here for s in row if s.variable in COMPILERS]
+    folders = {folder_of(settings) for settings in [[], *([s] for s in compilers)]}
+    if len(folders) <= len(compilers):
+        sys.exit("some settings that compile differently store code in one folder")
+
     rows = [(settings, *run(settings, arguments)) for settings in [[], *passes]]
 
     print("\n  passed  failed skipped  setting")
