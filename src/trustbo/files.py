@@ -22,7 +22,7 @@ FilePath = str | PathLike[str]
 TEMPORARY = ".tmp-"
 """Beginning of the names of temporary files."""
 _SIDE_FILES = (
-    ".aux.xml", ".ovr", ".ovr.aux.xml", ".ovr.msk", ".msk", ".msk.aux.xml", ".msk.ovr",
+    ".aux.xml", ".ovr", ".ovr.aux.xml", ".msk", ".msk.aux.xml", ".msk.ovr", ".msk.ovr.aux.xml",
     ".vat.dbf", ".vat.cpg",
 )  # fmt: skip
 """What GDAL and GIS append to the name of a raster to store its statistics, overviews and mask."""
