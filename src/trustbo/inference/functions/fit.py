@@ -104,10 +104,10 @@ def fit_function(
     observations = Observations.from_missions(missions)
     data = _data_for(model, missions, observations)
     sites = model.sites(data)
+    _sampler(model).require_gradient(data, sites)
     if workspace is not None:
         require_plannable(model, workspace)
     require_fittable(model, data, sites, [len(mission.bounds) for mission in missions])
-    _sampler(model).require_gradient(data, sites)
 
     first = _start(model, sites, data, start, chains, seed)
     samples, verdict = _sampled(
