@@ -20,4 +20,6 @@ def __getattr__(name: str) -> object:
     from trustbo.display import announced
 
     with announced("Loading libraries (a few seconds)."):
-        return _getattr(name)
+        found = _getattr(name)
+    globals()[name] = found  # the next use of the name does not come here
+    return found

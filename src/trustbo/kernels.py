@@ -16,7 +16,7 @@ from numba.core import event
 from trustbo.compiled import folder_of, warn_of_no_storage
 from trustbo.display import say_once
 
-config: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
+_CONFIG: Any = numba.config  # pyright: ignore[reportPrivateImportUsage]
 _VERSION = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}, {version('trustbo')}"
 """Numba checks the sources of a kernel, but not of the kernels that it calls."""
 
@@ -47,19 +47,19 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 def _store(made: Any) -> None:
     """Let numba store a kernel in the folder of compiled code, or in the user's NUMBA_CACHE_DIR."""
-    chosen = config.CACHE_DIR
+    chosen = _CONFIG.CACHE_DIR
     folder = Path(chosen) if chosen else folder_of("numba", _VERSION)
     if folder is None:
         return
 
     # Numba reads the setting here, and only here. Kernels of other packages keep their folder.
-    config.CACHE_DIR = str(folder)
+    _CONFIG.CACHE_DIR = str(folder)
     try:
         made.enable_caching()
     except RuntimeError:  # numba found no folder that can be written
         warn_of_no_storage(folder, "numba cannot write there")
     finally:
-        config.CACHE_DIR = chosen
+        _CONFIG.CACHE_DIR = chosen
 
 
 class _Announcement(event.Listener):
