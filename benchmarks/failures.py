@@ -37,7 +37,7 @@ from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.replicates import replicated
 from trustbo.study import worlds
 from trustbo.study.world import COURSES, World
-from trustbo.workspace.difficulty import difficulty_of
+from trustbo.workspace.difficulty import MEASURES
 from trustbo.workspace.moves import END, MOVES, bounds_and_next
 
 GROUNDS = (("topography", 18), ("tahoe", 18), ("synthetic-0", 14), ("wellington", 38))
@@ -195,7 +195,7 @@ def print_separation(given):
     for world in chosen[: 1 if given.quick else None]:
         simulator = world.simulator(world.workspace())
         passed = share_passed(simulator)
-        curve = difficulty_of(simulator.workspace).measures.sel(measure="tilt").values
+        curve = simulator.workspace.difficulty.whole().values[..., MEASURES.index("tilt")]
         route = route_tilts(simulator.workspace, np.isfinite(passed))
         of_world = [
             area_under(tilt, passed)

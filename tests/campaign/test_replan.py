@@ -15,7 +15,6 @@ from trustbo.hazard.risk import BoundRisk
 from trustbo.models import PooledTrust
 from trustbo.planning import NoPathError, Planner
 from trustbo.report import failed_bounds_of, replanned_of
-from trustbo.workspace.difficulty import difficulty_of
 from trustbo.workspace.moves import END, bounds_along, bounds_and_next
 
 ENDS = ((3, 0), (0, 3))
@@ -328,7 +327,7 @@ def test_a_bound_that_stopped_robots_is_not_planned_again_with_its_next_move(log
     k = 3
     planned = tuple(bounds_and_next(path)[k])
     before = campaign.risk.mean[planned]
-    of_units = difficulty_of(hilly).unit[planned[:3]]
+    of_units = hilly.difficulty.whole().unit[planned[:3]]
     assert of_units[planned[3]] not in (of_units[END], of_units[6])  # south is the way back
 
     def told(cells, statuses):

@@ -36,12 +36,17 @@ def test_partition_of_equal_values_is_one_group():
 
 
 @pytest.fixture(scope="module")
-def risk():
-    """Risk of steep ground after a failure, and a path over it."""
+def workspace():
+    """Steep ground."""
     robot = tb.Robot(max_slope=np.deg2rad(11.0))
     terrain = tb.terrain.synthetic_terrain((150.0, 150.0), resolution=2.0, seed=3, relief=8.0)
     team = tb.Team(robots=(robot,), lead=robot)
-    workspace = tb.Workspace.from_terrain(terrain, (5, 5), team, bounds=False)
+    return tb.Workspace.from_terrain(terrain, (5, 5), team, bounds=False)
+
+
+@pytest.fixture(scope="module")
+def risk(workspace):
+    """Risk after a failure, and a path."""
     path = [(4, 0), (3, 1), (2, 2), (1, 3), (0, 4)]
     lost = [LostMission(((4, 0), (3, 0), (2, 0)))]
     return BoundRisk(fit_hazard([], workspace, lost=lost), workspace), path
@@ -69,3 +74,26 @@ def test_few_strata_have_the_chance_to_fail_that_all_draws_have(risk):
     assert product > drawn.mean() + 0.04
     of_bounds = planner_risks[0].along(path).p_fail
     np.testing.assert_allclose(product, 1.0 - np.prod(1.0 - of_bounds), rtol=1e-9)
+
+
+def test_the_arrival_probability_is_that_of_many_draws(risk):
+    """Also of a path that enters a bound twice, whose first pass is evidence for the second."""
+    risk, path = risk
+    for driven in (path, [*path[:3], *path[1:3], *path[3:]]):
+        along = risk.along(driven)
+        index = bounds_and_next(driven).T
+        drawn = np.prod(1.0 - risk.draw(10_000, seed=1)[:, *index], axis=1)
+        # 5 standard errors; there are 1000 distinct hyperparameters.
+        assert abs(along.p_arrive - drawn.mean()) < 5.0 * drawn.std() / np.sqrt(1000)
+        np.testing.assert_allclose(along.p_arrive_band, np.quantile(drawn, (0.05, 0.95)), atol=0.06)
+        np.testing.assert_allclose(along.p_fail, risk.mean[*index], rtol=1e-12)
+    assert along.p_arrive > np.prod(1.0 - along.p_fail) + 0.01
+
+
+def test_a_planner_searches_with_the_components_of_a_risk(workspace, risk):
+    risk, path = risk
+    planner = tb.Planner(workspace, path[0], path[-1], max_failure=0.9)
+    own = planner.with_risk(risk).problem
+    given = planner.with_risk(risk.mean, components=risk.components()).problem
+    assert own.risk.failure(path) == given.risk.failure(path)
+    np.testing.assert_array_equal(own.risks.of_edges, given.risks.of_edges)

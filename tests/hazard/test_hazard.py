@@ -14,7 +14,7 @@ from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard, impute, sample
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import UNKNOWN, LostMission, Trials
-from trustbo.workspace.difficulty import difficulty_of
+from trustbo.workspace.difficulty import MEASURES
 from trustbo.workspace.moves import END, MOVES
 
 
@@ -164,7 +164,7 @@ def test_a_vague_prior_on_the_strength_gives_the_posterior_of_quadrature():
     mean = (weight * p).sum() / weight.sum()
     sd = np.sqrt((weight * (p - mean) ** 2).sum() / weight.sum())
 
-    entered = found["p_fail"].sel(move="e", next_move="end").values[0, 1]
+    entered = BoundRisk(found, workspace()).mean[4, 0, 1, END]
     assert abs(entered - mean) < 4.5 * sd / np.sqrt(found.attrs["kish"])
 
 
@@ -369,7 +369,6 @@ def test_a_failed_bound_has_a_higher_risk_and_a_completed_one_a_lower():
     assert np.isnan(risk.mean[4, 0, 0]).all()  # no cell west of the grid
     # Without a terrain, nothing says how next moves differ: they share what was learned.
     np.testing.assert_array_equal(risk.mean[4, 0, 2, 0], risk.mean[second])
-    np.testing.assert_array_equal(group["p_fail"].values, risk.mean)
 
 
 def test_draws_of_chances_have_the_means_of_the_map():
@@ -395,7 +394,7 @@ def hilly():
 
 
 def test_one_failure_on_steep_ground_teaches_all_that_is_as_steep(hilly):
-    tilt = np.nan_to_num(difficulty_of(hilly).measures.sel(measure="tilt").values)
+    tilt = np.nan_to_num(hilly.difficulty.whole().values[..., MEASURES.index("tilt")])
     # Ends of paths alone, of which each is another unit.
     steepest = np.argsort(tilt[..., END].ravel())[::-1][:6]
     assert 0.8 < tilt[..., END].flat[steepest[-1]] < 1.2
@@ -434,7 +433,7 @@ def test_the_same_seed_gives_the_same_hazard():
     lost = [LostMission(ROW)]
     one, other = (fit_hazard(told, ws, lost=lost, seed=3) for _ in range(2))
     assert one.drop_attrs().identical(other.drop_attrs())
-    assert not one["p_fail"].equals(fit_hazard(told, ws, lost=lost, seed=4)["p_fail"])
+    assert not one["intercept"].equals(fit_hazard(told, ws, lost=lost, seed=4)["intercept"])
 
 
 def test_a_bad_proposal_is_refused(monkeypatch):
@@ -457,7 +456,7 @@ def test_a_hazard_of_another_workspace_is_refused(hilly):
         BoundRisk(fit_hazard([], ws), walled)
 
     flat = tb.Workspace.from_awareness(np.full((1, *hilly.grid.shape, 1), 0.5))
-    of_hilly = fit_hazard([], hilly).drop_vars("p_fail")
+    of_hilly = fit_hazard([], hilly).drop_vars("is_bound")
     with pytest.raises(TrustboError, match="measures"):
         BoundRisk(of_hilly, flat)
 

@@ -9,7 +9,7 @@ from worlds import Steady
 
 from trustbo.simulation.motion import drive
 from trustbo.team import Robot
-from trustbo.workspace.pursuit import largest_tilt
+from trustbo.workspace.pursuit import Driving, tilt_along
 from trustbo.workspace.routes import Routes
 from trustbo.workspace.surface import Surface
 
@@ -79,7 +79,9 @@ def test_the_largest_tilt_is_that_of_a_drive_without_slip():
     heading = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])])
     left = np.stack([-heading[1], heading[0]])
     tilts = [np.abs((slopes * axis).sum(0)).max() for axis in (heading, left)]
-    assert largest_tilt(surface, Robot(), route) == pytest.approx(max(tilts), rel=0.03)
+    place = surface.gradient, surface.pixel, surface.origin
+    largest = tilt_along(*place, route, Driving.of(Robot()))
+    assert largest == pytest.approx(max(tilts), rel=0.03)
 
 
 def test_steeper_is_slower():

@@ -18,8 +18,6 @@ from trustbo.planning import Plan, Planner
 from trustbo.stacking import pooled
 from trustbo.workspace import Workspace
 
-_N_RISKS = 200
-"""Number of posterior draws of the failure probabilities."""
 _STOPPED = 2
 """Number of failures after which a bound is avoided."""
 _RECOVERED = 0.2
@@ -223,20 +221,23 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     if planner.problem.failure_cost is None and not risk.has_failures:
         planner = planner.with_failure_cost(0.0)
 
+    planner = planner.with_risk(risk)
     problem = planner.problem
     priced = problem.objective.of_contact and problem.failure_cost != 0.0
+    n_stopped = risk.stopped if priced else risk.stopped_with_any_next[..., None]
+    stopped = n_stopped + _ROUNDING >= _STOPPED
+    if not stopped.any():
+        return planner
+
     is_likely = ~(risk.mean < _RECOVERED)
     if priced:
-        stopped = (risk.stopped + _ROUNDING >= _STOPPED) & is_likely
+        stopped &= is_likely
         avoided = stopped.any(-1) & (stopped | ~risk.exists).all(-1)
     else:
-        stopped = risk.stopped_with_any_next + _ROUNDING >= _STOPPED
-        avoided = stopped & (is_likely & risk.exists).any(-1)
-    if avoided.any():
-        planner = planner.avoiding(avoided, np.nanmax(risk.mean, axis=-1, initial=0.0))
-
-    components = risk.components() if priced or problem.max_failure is not None else None
-    return planner.with_risk(risk.mean, risk.draw(_N_RISKS), components)
+        avoided = stopped.any(-1) & (is_likely & risk.exists).any(-1)
+    if not avoided.any():
+        return planner
+    return planner.avoiding(avoided, np.nanmax(risk.mean, axis=-1, initial=0.0))
 
 
 def instead_of_failure(planner: Planner, plan: Plan, draws: Draws) -> Plan:

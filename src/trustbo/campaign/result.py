@@ -152,6 +152,9 @@ class Result(Summary):
     def posterior(self) -> xr.DataTree:
         """Posterior after the last mission, with all groups, for ArviZ.
 
+        The group `hazard` also contains `p_fail` (move, row, col, next_move), the posterior mean
+        failure probability of each bound; NaN where there is no bound.
+
         Its missions are labelled by their index in `missions`. Those of earlier campaigns come
         first and have negative labels, -1 for the last. To add all groups to an earlier
         posterior, use `inference.add_latent`.
@@ -173,7 +176,8 @@ class Result(Summary):
         for group in whole.children.values():
             if "mission" in group.dims:
                 group.dataset = group.to_dataset().assign_coords(mission=indices)
-        whole["hazard"] = xr.DataTree(self.hazard)
+        p_fail = self.hazard["trials"].copy(data=self.risk.mean)
+        whole["hazard"] = xr.DataTree(self.hazard.assign(p_fail=p_fail))
         return whole
 
     @property
@@ -378,7 +382,7 @@ class Result(Summary):
             Dataset with the dims (y, x), whose coordinates are the centres of the cells in CRS
             metres; `isel(y=row, x=col)` selects a cell, and the accessor `.rio` writes rasters.
         """
-        draws = self._beliefs if self.state.posterior is None else self.posterior
+        draws = self._beliefs if self.state.posterior is None else self.belief
         return self.planner.maps(draws, n_draws=n_draws)
 
     def plot_maps(self, **options: Any) -> np.ndarray:

@@ -24,14 +24,14 @@ from scipy import special, stats
 
 from trustbo.data import Cell, Mission, require_map
 from trustbo.errors import PosteriorError, TrustboError, require_whole
-from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, TILT, BoundPrior, Hazard
-from trustbo.hazard.risk import BoundRisk, add_lost
+from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, BoundPrior, Hazard
+from trustbo.hazard.risk import add_lost
 from trustbo.hazard.trials import LostMission, Trials
 from trustbo.inference import importance
 from trustbo.parallel import computing
 from trustbo.stacking import list_of_missions
 from trustbo.workspace import Workspace
-from trustbo.workspace.difficulty import Difficulty, difficulty_of
+from trustbo.workspace.difficulty import TILT
 from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES
 
 _ROUND = 1024
@@ -66,7 +66,9 @@ def fit_hazard(
     goal: Cell | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Fit the failure probability of every bound and next move by importance sampling.
+    """Fit the hazard model to missions by importance sampling.
+
+    Only the difficulty of bounds that were attempted is measured.
 
     Args:
         missions: Measured missions on the map of the workspace; may be empty.
@@ -82,12 +84,11 @@ def fit_hazard(
         The group `hazard` of a posterior. The posterior draws are `intercept` (draw), `coefficient`
         (draw, measure), `strength` (draw) and, with a terrain, `margin` and `width` (draw) of the
         slope limit in degrees. `place` (draw, lost) is the number, from 1, of the bound at which
-        each mission lost at an unknown place failed. `p_fail` (move, row, col, next_move) is the
-        posterior mean failure probability of a bound that is followed by a given next move or by
-        the end of the path; it is NaN where there is no bound. `trials` and `failures`, of the same
-        shape, count known outcomes; a failure whose next move is unknown, because the robots turned
-        back or the log ends, is shared equally by all next moves. `BoundRisk` draws failure
-        probabilities.
+        each mission lost at an unknown place failed. `trials` and `failures` (move, row, col,
+        next_move) count known outcomes of a bound that is followed by a given next move or by the
+        end of the path; a failure whose next move is unknown, because the robots turned back or the
+        log ends, is shared equally by all next moves. `is_bound` (move, row, col) says which bounds
+        exist. `BoundRisk` computes the failure probabilities of all bounds from this group.
 
     Raises:
         TrustboError: If a mission has no map or is on another map (see `Mission.map`), or if its
@@ -96,7 +97,7 @@ def fit_hazard(
 
     Example:
         >>> hazard = tb.hazard.fit_hazard(missions, workspace)
-        >>> hazard["p_fail"].max().item()  # of the most dangerous bound
+        >>> np.nanmax(tb.hazard.BoundRisk(hazard, workspace).mean)  # of the most dangerous bound
     """
     started = time.perf_counter()
     hazard = hazard or Hazard()
@@ -110,31 +111,32 @@ def fit_hazard(
             )
 
     trials = Trials.from_missions(missions, lost, goal)
-    difficulty = difficulty_of(workspace)
-
-    measures = difficulty.measures
-    shape = measures.shape[1:3]
+    difficulty = workspace.difficulty
+    shape = difficulty.exists.shape[1:3]
     cells = trials.bounds[:, 1:3]
     outside = ((cells < 0) | (cells >= shape)).any(1)
     if outside.any():
         cell = tuple(cells[outside][0].tolist())
         raise TrustboError(f"a mission enters {cell}, outside the workspace of shape {shape}.")
 
-    trials = trials.with_known_next(difficulty.unit)
+    unit = np.full(difficulty.exists.shape, -1)  # of the attempted bounds only
+    unit[*trials.bounds.T[:3]] = difficulty.of(trials.bounds[:, :3]).unit
+    trials = trials.with_known_next(unit)
 
     # A bound that the robots drove, but that does not exist on the map, has the largest difficulty.
-    units = trials.of_units(difficulty.unit)
-    met = np.nan_to_num(measures.values[*units.bounds.T], nan=1.0)
-    names = measures["measure"].values.tolist()
+    units = trials.of_units(unit)
+    measured = difficulty.of(units.bounds[:, :3]).values
+    met = np.nan_to_num(measured[np.arange(len(measured)), units.bounds[:, 3]], nan=1.0)
+    names = difficulty.measures
     prior = hazard.of_bounds(met, names, workspace.team.max_slope)
     rng = np.random.default_rng(require_whole("seed", seed, 0))
     points, places = sample(prior, units, rng)
 
-    group = _to_dataset(prior, trials, points, places, difficulty, seed)
+    weighted = [name for name in names if name != TILT]
+    group = _to_dataset(prior, trials, points, places, weighted, difficulty.exists, seed)
     k_hat = float(np.clip(points.k_hat, -1.0, _LARGEST_KHAT))
     group.attrs = {"k_hat": k_hat, "kish": points.kish, "seed": seed}
     group.attrs |= {f"prior_{name}": list(value) for name, value in asdict(hazard).items()}
-    group = group.assign(p_fail=(_MAPS, BoundRisk(group, workspace).mean))
     group.attrs["seconds"] = time.perf_counter() - started
 
     if not points.k_hat <= importance.MAX_KHAT:
@@ -294,10 +296,15 @@ def _to_dataset(
     trials: Trials,
     points: importance.Points,
     places: np.ndarray,
-    difficulty: Difficulty,
+    measures: Sequence[str],
+    exists: np.ndarray,
     seed: int,
 ) -> xr.Dataset:
-    """Make the group `hazard` without `p_fail` and attributes."""
+    """Make the group `hazard` without attributes.
+
+    `measures` are the names of the measures that have weights, and `exists` says which bounds
+    exist, shape (move, row, col, next_move).
+    """
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(points.resample(_N_DRAWS, rng))
     weights, limit, strength = prior.values(points.z[chosen])
@@ -308,8 +315,8 @@ def _to_dataset(
         for name, values in zip(LIMIT_NAMES, limit.T, strict=False)  # empty without a limit
     }
 
-    n = np.zeros(difficulty.unit.shape)
-    failed = np.zeros(difficulty.unit.shape)
+    n = np.zeros(exists.shape)
+    failed = np.zeros(exists.shape)
     n[*trials.bounds.T] = trials.n
     failed[*trials.bounds.T] = trials.failed
 
@@ -328,10 +335,11 @@ def _to_dataset(
             "lost_bound": (("lost", "bound", "axis"), lost),
             "trials": (_MAPS, n),
             "failures": (_MAPS, failed),
+            "is_bound": (_MAPS[:-1], exists.any(-1)),
         },
         {
             "draw": np.arange(_N_DRAWS),
-            "measure": [m for m in difficulty.measures["measure"].values.tolist() if m != TILT],
+            "measure": list(measures),
             "axis": list(_MAPS),
             "move": list(MOVE_NAMES),
             "next_move": list(NEXT_NAMES),

@@ -10,11 +10,10 @@ from scipy import special
 from scipy.interpolate import PchipInterpolator
 
 from trustbo.errors import TrustboError, require_positive, require_tuple
+from trustbo.workspace.difficulty import TILT
 
 REFERENCE = 0.5
 """Difficulty at which the intercept is the logit of the prior mean."""
-TILT = "tilt"
-"""Name of the difficulty measure to which the slope limit applies."""
 LIMIT_NAMES = ("margin", "width")
 """Parameters of the robots' slope limit, in degrees."""
 FLOOR = 1e-12

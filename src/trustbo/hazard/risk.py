@@ -14,9 +14,9 @@ from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import OldName, Renamed, TrustboError, one_line, require_whole
 from trustbo.hazard.components import Components, partition
-from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, TILT, prior_betas, steepness_of
+from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, prior_betas, steepness_of
 from trustbo.workspace import Workspace
-from trustbo.workspace.difficulty import difficulty_of
+from trustbo.workspace.difficulty import TILT
 from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES, bounds_and_next
 
 ROUNDING = 1e-12
@@ -48,8 +48,9 @@ class BoundRisk(Summary):
         trials: Number of times that each bound is known to have been completed or to have failed,
             shape (move, row, col, next_move).
         failures: Number of failures at a known bound, shape (move, row, col, next_move).
-        steepness: Degrees by which each bound exceeds the stated slope limit, shape (move, row,
-            col, next_move); None without a limit.
+
+    The risk of a path needs the difficulty of its bounds only. Maps need that of all bounds, which
+    is measured when a map is first computed.
 
     Example:
         >>> risk = tb.hazard.BoundRisk(tb.hazard.fit_hazard(missions, workspace), workspace)
@@ -66,8 +67,8 @@ class BoundRisk(Summary):
             TrustboError: If the group was made by version 0.4 or earlier, or if its bounds or its
                 measures of difficulty are not those of the workspace.
         """
-        difficulty = difficulty_of(workspace)
-        shape = difficulty.unit.shape
+        difficulty = workspace.difficulty
+        shape = difficulty.exists.shape
         hazard = in_order("the hazard posterior", hazard, _LABELS)
         hazard = hazard.transpose(*_DIMS, missing_dims="ignore")
         if hazard["trials"].shape != shape:
@@ -77,47 +78,29 @@ class BoundRisk(Summary):
                 "again with the missions; posteriors of trustbo 0.4 have no next moves."
             )
 
-        self.exists = difficulty.unit >= 0
-        self._mean = hazard["p_fail"].values if "p_fail" in hazard else None
-        if self._mean is not None:
-            is_bound = np.isfinite(self._mean).any(-1)
-            if not np.array_equal(is_bound, self.exists.any(-1)):
-                raise TrustboError(
-                    "the hazard posterior has other bounds than this workspace; call fit_hazard "
-                    "again with this workspace."
-                )
-
-        self.trials = hazard["trials"].values
-        self.failures = hazard["failures"].values
-
-        # A unit is a bound with one or more next moves; see `workspace.difficulty`.
-        is_first = difficulty.unit == np.arange(shape[-1])
-        self._is_first = is_first
-        number = np.full(shape, -1)
-        number[is_first] = np.arange(is_first.sum())
-        first = np.maximum(difficulty.unit, 0)
-        self._unit = np.where(self.exists, np.take_along_axis(number, first, -1), -1)
-        self._trials = self._of_units(self.trials)
-        self._failures = self._of_units(self.failures)
+        self.exists = difficulty.exists
+        if "is_bound" in hazard and (hazard["is_bound"].values != self.exists.any(-1)).any():
+            raise TrustboError(
+                "the hazard posterior has other bounds than this workspace; call fit_hazard "
+                "again with this workspace."
+            )
 
         names = hazard["measure"].values.tolist()
-        missing = set(names) - set(difficulty.measures["measure"].values.tolist())
-        if missing:
+        if set(names) - set(difficulty.measures):
             raise TrustboError(
                 f"the hazard posterior needs the measures of difficulty {', '.join(names)}, which "
                 "a workspace without a terrain does not have; call fit_hazard again with this "
                 "workspace."
             )
+
+        self.trials = hazard["trials"].values
+        self.failures = hazard["failures"].values
+        self._difficulty = difficulty
+        self._measures = [difficulty.measures.index(name) for name in names]
+        self._max_slope = workspace.team.max_slope
+
         limit = [n for n in LIMIT_NAMES if n in hazard]
-        self._difficulty = difficulty.measures.sel(measure=names).values[is_first] - REFERENCE
-        self.steepness = None
-        self._steepness = None
-
-        if limit:
-            tilt = difficulty.measures.sel(measure=TILT).values
-            self.steepness = steepness_of(tilt, workspace.team.max_slope)
-            self._steepness = self.steepness[is_first]
-
+        self._has_limit = bool(limit)
         self._strength = hazard["strength"].values  # (draw,)
         intercept = hazard["intercept"].values[:, None]
         coefficient = hazard["coefficient"].values
@@ -128,6 +111,11 @@ class BoundRisk(Summary):
 
         self._lost = [path[path[:, 0] >= 0] for path in hazard["lost_bound"].values]
         self._place = hazard["place"].values  # (draw, lost), from 1
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the maps."""
+        return self.exists.shape
 
     def _rows(self) -> Rows:
         is_bound = self.exists.any(-1)
@@ -144,32 +132,59 @@ class BoundRisk(Summary):
             *_rows_of_failures(self.mean),
         ]
 
-    def _of_units(self, counts: np.ndarray) -> np.ndarray:
-        """Add up counts (move, row, col, next_move) over the next moves of each unit, (unit,)."""
-        n_units = int(self._unit.max(initial=-1)) + 1
-        return np.bincount(self._unit[self.exists], counts[self.exists], n_units)
+    @cached_property
+    def steepness(self) -> np.ndarray | None:
+        """Degrees by which each bound exceeds the stated slope limit; None without a limit.
+
+        The shape is (move, row, col, next_move).
+        """
+        if not self._has_limit:
+            return None
+        return self._steepness_of(self._difficulty.whole().values)
+
+    def _steepness_of(self, measures: np.ndarray) -> np.ndarray:
+        """Return the steepness (...) of bounds with the measures (..., measure)."""
+        tilt = measures[..., self._difficulty.measures.index(TILT)]
+        return steepness_of(tilt, self._max_slope)
+
+    @cached_property
+    def _units(self) -> np.ndarray:
+        """All units as bounds with their first next move, shape (unit, 4)."""
+        unit = self._difficulty.whole().unit
+        return np.argwhere(unit == np.arange(unit.shape[-1]))
+
+    @cached_property
+    def _number(self) -> np.ndarray:
+        """Index of each bound's unit in `_units`, (move, row, col, next_move); -1 if none."""
+        first = self._difficulty.whole().unit
+        number = np.full(first.shape, -1)
+        number[*self._units.T] = np.arange(len(self._units))
+        of_first = np.take_along_axis(number, np.maximum(first, 0), -1)
+        return np.where(first >= 0, of_first, -1)
 
     def _maps(self, values: np.ndarray) -> np.ndarray:
         """Return values (..., unit) as maps (..., move, row, col, next_move)."""
         nowhere = np.full((*values.shape[:-1], 1), np.nan)
         values = np.concatenate([values, nowhere], axis=-1)
 
-        of_bounds = self._unit.max(-1)
-        if ((self._unit == of_bounds[..., None]) | ~self.exists).all():  # as without a terrain
+        of_bounds = self._number.max(-1)
+        if ((self._number == of_bounds[..., None]) | ~self.exists).all():  # as without a terrain
             maps = values[..., of_bounds]
-            return np.broadcast_to(maps[..., None], (*maps.shape, self._unit.shape[-1]))
-        return values[..., self._unit]
+            return np.broadcast_to(maps[..., None], (*maps.shape, self._number.shape[-1]))
+        return values[..., self._number]
 
     @cached_property
     def mean(self) -> np.ndarray:
         """Posterior mean of the failure probability, shape (move, row, col, next_move)."""
-        if self._mean is not None:
-            return self._mean
-
-        mean = np.empty(len(self._trials))
+        mean = np.empty(len(self._units))
         for units, a, b in self._betas():
             mean[units] = (a / (a + b)).mean(0)
         return self._maps(mean)
+
+    @property
+    def of_bounds(self) -> np.ndarray:
+        """Failure probability of each bound, shape (move, row, col), averaged over next moves."""
+        return over_next_moves(self.mean)
 
     @property
     def has_failures(self) -> bool:
@@ -182,23 +197,39 @@ class BoundRisk(Summary):
 
         Next moves with the same steepest route share their failures.
         """
-        return np.nan_to_num(self._maps(self._expected_failures))
+        counts = self.failures.copy()
+        for j, path in enumerate(self._lost):
+            for k, bound in enumerate(path, start=1):
+                counts[*bound] += (self._place[:, j] == k).mean()
+
+        stopped = np.zeros(counts.shape)
+        bounds = np.argwhere(counts.any(-1))
+        same = self._same_unit(bounds)
+        stopped[*bounds.T] = np.where(same, counts[*bounds.T][:, None, :], 0.0).sum(-1)
+        return stopped
 
     @cached_property
     def stopped_with_any_next(self) -> np.ndarray:
         """Posterior mean of the number of past failures of each bound, shape (move, row, col)."""
-        return np.where(self._is_first, self.stopped, 0.0).sum(-1)
+        bounds = np.argwhere(self.stopped.any(-1))
+        unit = self._difficulty.of(bounds).unit
+        is_first = unit == np.arange(unit.shape[-1])
+        stopped = np.zeros(self.stopped.shape[:-1])
+        stopped[*bounds.T] = np.where(is_first, self.stopped[*bounds.T], 0.0).sum(-1)
+        return stopped
 
-    @cached_property
-    def _expected_failures(self) -> np.ndarray:
-        """Posterior mean of the number of past failures of each unit, shape (unit,)."""
-        counts = self._failures.copy()
-        for j, path in enumerate(self._lost):
-            for k, bound in enumerate(path, start=1):
-                unit = self._unit[*bound]
-                if unit >= 0:
-                    counts[unit] += (self._place[:, j] == k).mean()
-        return counts
+    def _same_unit(self, bounds: np.ndarray) -> np.ndarray:
+        """Return which next moves of bounds (bound, 3) are one unit, (bound, next_move, next_move).
+
+        Next moves that do not exist are in no unit.
+        """
+        unit = self._difficulty.of(bounds).unit
+        return (unit[..., None] == unit[:, None, :]) & (unit >= 0)[..., None]
+
+    def _units_at(self, bounds: np.ndarray) -> np.ndarray:
+        """Replace the next moves of bounds (bound, 4) by the first of their unit, -1 if none."""
+        unit = self._difficulty.of(bounds[:, :3]).unit
+        return np.column_stack([bounds[:, :3], unit[np.arange(len(bounds)), bounds[:, 3]]])
 
     def draw(self, n: int, seed: int = 0) -> np.ndarray:
         """Draw the failure probabilities, shape (draw, move, row, col, next_move).
@@ -213,7 +244,7 @@ class BoundRisk(Summary):
         steps = (np.arange(require_whole("n", n, 1)) + 0.5) / n
         chosen = rng.permutation(order[(steps * len(order)).astype(int)])
 
-        out = np.empty((n, len(self._trials)))
+        out = np.empty((n, len(self._units)))
         for units, a, b in self._betas(chosen):
             out[:, units] = rng.beta(a, b)
         return self._maps(out)
@@ -232,46 +263,90 @@ class BoundRisk(Summary):
         # One product averages over the members of each group.
         weights = (member == np.arange(len(ends))[:, None]) / sizes[:, None]
 
-        p_fail = np.empty((len(ends), len(self._trials)))
+        p_fail = np.empty((len(ends), len(self._units)))
         for units, a, b in self._betas():
             p_fail[:, units] = weights @ (a / (a + b))
         return Components(self._maps(p_fail), sizes / sizes.sum())
 
     @cached_property
+    def searched(self) -> Components:
+        """Components with which paths are searched."""
+        return self.components()
+
+    def failure(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """Compute the failure probability of a path, for `failure_cost` and `max_failure`.
+
+        It is averaged over the components, as in a search; see `along` for the exact mean.
+        """
+        return failure_in(self.searched, path)
+
+    def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
+        """Compute the risk along a path, without the risk of other bounds.
+
+        Given the hyperparameters, units fail independently, with probabilities that have Beta
+        distributions. The arrival probability is averaged over the draws of the hyperparameters.
+        """
+        of_bounds = self._units_at(bounds_and_next(path))
+        units, index = np.unique(of_bounds, axis=0, return_inverse=True)
+        a, b = self._betas_of(units)
+        p_fail = (a / (a + b)).mean(0)[index]
+
+        # If a unit is passed several times, each pass is evidence for the next one.
+        arrives = np.ones(len(a))
+        n_passed = np.zeros(len(units))
+        for unit in index:
+            passed = b[:, unit] + n_passed[unit]
+            arrives *= passed / (a[:, unit] + passed)
+            n_passed[unit] += 1.0
+
+        drawn = np.random.default_rng(0).beta(a, b)[:, index]
+        low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
+        return PathRisk(p_fail, float(arrives.mean()), (low, high))
+
+    @cached_property
     def _severity(self) -> np.ndarray:
         """Mean failure probability (draw,) over a subset of units for each hyperparameter draw."""
-        n_units = len(self._trials)
-        step = 1 + n_units // _SOME
-        a, b = self._betas_of(slice(0, n_units, step))
+        a, b = self._betas_of(self._units[:: 1 + len(self._units) // _SOME])
         return (a / (a + b)).mean(1)
 
     def _betas(self, draws: Any = slice(None)) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-        """Yield chunks of units: their slice, and alpha and beta (draw, unit)."""
+        """Yield chunks of all units: their slice, and alpha and beta (draw, unit)."""
         n_draws = len(self._strength[draws])
         step = max(1, _ENTRIES // n_draws)
-        for start in range(0, len(self._trials), step):
+        for start in range(0, len(self._units), step):
             units = slice(start, start + step)
-            yield units, *self._betas_of(units, draws)
+            yield units, *self._betas_of(self._units[units], draws)
 
-    def _betas_of(self, units: slice, draws: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-        """Return alpha and beta (draw, unit) of the posterior Beta distributions of units."""
+    def _betas_of(
+        self, units: np.ndarray, draws: Any = slice(None)
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return alpha and beta (draw, unit) of the posterior Beta distributions of units.
+
+        Units (unit, 4) are distinct bounds with the first next move of the unit.
+        """
+        bounds = units[:, :3]
+        of_unit = np.arange(len(units)), units[:, 3]
+        measures = self._difficulty.of(bounds).values[of_unit]
         a, b = prior_betas(
             self._weights[draws],
             self._limit[draws],
             self._strength[draws],
-            self._difficulty[units],
-            None if self._steepness is None else self._steepness[units],
+            measures[:, self._measures] - REFERENCE,
+            self._steepness_of(measures) if self._has_limit else None,
         )
 
-        failed = self._failures[units]
+        member = self._same_unit(bounds)[of_unit]  # (unit, next_move)
+        failed, trials = (
+            np.where(member, counts[*bounds.T], 0.0).sum(-1)
+            for counts in (self.failures, self.trials)
+        )
         a += failed
-        b += self._trials[units] - failed
+        b += trials - failed
 
-        n_units = len(self._trials)
-        position = np.full(n_units + 1, -1)  # the last entry stands for bounds that do not exist
-        position[:n_units][units] = np.arange(len(failed))
+        position = {bound: k for k, bound in enumerate(map(tuple, units.tolist()))}
         for j, path in enumerate(self._lost):
-            add_lost(position[self._unit[*path.T]], self._place[draws, j] - 1, a, b)
+            at = [position.get(bound, -1) for bound in map(tuple, self._units_at(path).tolist())]
+            add_lost(np.array(at), self._place[draws, j] - 1, a, b)
         return a, b
 
 
@@ -296,10 +371,24 @@ def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) 
             b[:, e] += place > k
 
 
+def over_next_moves(p_fail: np.ndarray) -> np.ndarray:
+    """Average failure probabilities (move, row, col, next_move) over the next moves that exist."""
+    known = np.isfinite(p_fail)
+    total = np.where(known, p_fail, 0.0).sum(-1)
+    return np.where(known.any(-1), total / np.maximum(known.sum(-1), 1), np.nan)
+
+
+def failure_in(components: Components, path: Sequence[Cell] | np.ndarray) -> float:
+    """Compute the failure probability of a path, averaged over components."""
+    p_fail, weights = components
+    index = bounds_and_next(path).T
+    return float(weights @ (1.0 - np.prod(1.0 - p_fail[:, *index], axis=1)))
+
+
 @Renamed(strata="components")
 @dataclass(frozen=True, eq=False, repr=False)
 class Risk(Summary):
-    """Probability that each bound of a workspace ends the mission.
+    """Given probability that each bound of a workspace ends the mission.
 
     Attributes:
         p_fail: Posterior mean, shape (move, row, col, next_move), with moves as in `MOVES`. The
@@ -340,6 +429,11 @@ class Risk(Summary):
                     f"{one_line(weights)}."
                 )
 
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of `p_fail`."""
+        return self.p_fail.shape
+
     def _rows(self) -> Rows:
         n_draws = 0 if self.draws is None else len(self.draws)
         together = "independent" if self.components is None else "correlated"
@@ -352,9 +446,12 @@ class Risk(Summary):
     @property
     def of_bounds(self) -> np.ndarray:
         """Failure probability of each bound, shape (move, row, col), averaged over next moves."""
-        known = np.isfinite(self.p_fail)
-        total = np.where(known, self.p_fail, 0.0).sum(-1)
-        return np.where(known.any(-1), total / np.maximum(known.sum(-1), 1), np.nan)
+        return over_next_moves(self.p_fail)
+
+    @property
+    def searched(self) -> Components:
+        """Components with which paths are searched; by default, bounds fail independently."""
+        return self.components or Components(self.p_fail[None], np.ones(1))
 
     def failure(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Compute the failure probability of a path, for `failure_cost` and `max_failure`.
@@ -362,12 +459,7 @@ class Risk(Summary):
         The failure probability is averaged over the components, because failures of bounds are
         correlated.
         """
-        index = tuple(bounds_and_next(path).T)
-        if self.components is None:
-            return float(1.0 - np.prod(1.0 - self.p_fail[index]))
-
-        p_fail, weights = self.components
-        return float(weights @ (1.0 - np.prod(1.0 - p_fail[:, *index], axis=1)))
+        return failure_in(self.searched, path)
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
         """Compute the risk along a path."""

@@ -22,7 +22,7 @@ from trustbo.errors import (
     require_whole,
 )
 from trustbo.hazard.components import Components
-from trustbo.hazard.risk import Risk, read_risk
+from trustbo.hazard.risk import BoundRisk, Risk, read_risk
 from trustbo.kernels import stopwatch
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
@@ -220,7 +220,7 @@ class Planner(Summary):
     @Renamed(strata="components")
     def with_risk(
         self,
-        p_fail: ArrayLike,
+        p_fail: BoundRisk | ArrayLike,
         draws: ArrayLike | None = None,
         components: Components | None = None,
     ) -> Self:
@@ -230,9 +230,9 @@ class Planner(Summary):
         lost_contact, the value of a plan includes the expected cost of failure.
 
         Args:
-            p_fail: Posterior mean, such as `BoundRisk.mean`, shape (move, row, col, next_move),
-                where the last next move is the end of the path; or shape (move, row, col) if the
-                next move does not matter. NaN where there is no bound.
+            p_fail: A `BoundRisk`, without other arguments. Or posterior means of the shape (move,
+                row, col, next_move), where the last next move is the end of the path, or (move,
+                row, col) if the next move does not matter; NaN where there is no bound.
             draws: Posterior draws, with a leading axis (draw,), for `p_arrive` and its 90 % band.
             components: Mean failure probabilities of groups of draws, with a leading axis
                 (component,), such as `BoundRisk.components()`. They are used for the expected cost
@@ -242,6 +242,9 @@ class Planner(Summary):
             TrustboError: If the shapes do not match, a probability is outside [0, 1], or the
                 weights of the components do not sum to 1.
         """
+        if isinstance(p_fail, BoundRisk):
+            return self._with(risk=p_fail)
+
         mean = read_risk("p_fail", p_fail)
         drawn = None if draws is None else read_risk("draws", draws, ("draw",))
         if components is not None:

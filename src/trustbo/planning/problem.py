@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_positive
-from trustbo.hazard.components import Components
-from trustbo.hazard.risk import ROUNDING, Risk
+from trustbo.hazard.risk import ROUNDING, BoundRisk, Risk
 from trustbo.inference.learner import expected_and_drawn, params_of
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES, Family
@@ -80,7 +79,7 @@ class Problem:
     bound_cost: np.ndarray
     max_failure: float | None = None
     failure_cost: float | None = None
-    risk: Risk | None = None
+    risk: BoundRisk | Risk | None = None
     x0: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -98,8 +97,8 @@ class Problem:
                 )
 
         shape = (*self.paths.bounds.shape, END + 1)
-        if self.risk is not None and self.risk.p_fail.shape != shape:
-            raise TrustboError(f"p_fail must have the shape {shape}; got {self.risk.p_fail.shape}.")
+        if self.risk is not None and self.risk.shape != shape:
+            raise TrustboError(f"p_fail must have the shape {shape}; got {self.risk.shape}.")
 
     @property
     def cost_of_failure(self) -> float:
@@ -235,7 +234,7 @@ class Problem:
         if self.risk is None or (self.max_failure is None and self.cost_of_failure == 0.0):
             return None
 
-        p_fail, weights = self._components
+        p_fail, weights = self.risk.searched
         missing = np.isnan(p_fail).any(0) & possible_next(self.paths.bounds)
         if missing.any():
             move, row, col, after = np.argwhere(missing)[0].tolist()
@@ -248,12 +247,6 @@ class Problem:
         limit = np.inf if self.max_failure is None else self.max_failure + ROUNDING
         risks = self.paths.paired.of_edges(risks_by_bound(p_fail))
         return Risks(risks, self.cost_of_failure, weights, limit)
-
-    @property
-    def _components(self) -> Components:
-        """Components of the risk, or a single one with the mean failure probabilities."""
-        risk = cast("Risk", self.risk)
-        return risk.components or Components(risk.p_fail[None], np.ones(1))
 
     def best(self, recursion: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the best admissible path for each draw of the recursion, or for a single draw.
@@ -316,7 +309,7 @@ class Problem:
         """
         paired = self.paths.paired
         graph = paired.graph
-        p_fail, weights = self._components
+        p_fail, weights = cast("BoundRisk | Risk", self.risk).searched
         n_bounds = self.bound_cost.size
         n = graph.longest + 1
 

@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.hazard.risk import Risk
+from trustbo.hazard.risk import BoundRisk, Risk
 from trustbo.models.draws import Draws
 from trustbo.planning.objectives import capped, has_history
 from trustbo.planning.paths import AdmissiblePaths
@@ -70,7 +70,9 @@ def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None 
             best = path
             best_value = value
     if best is None:
-        raise _infeasible(problem, cast("Risk", problem.risk))  # without a risk, no path is refused
+        raise _infeasible(
+            problem, cast("BoundRisk | Risk", problem.risk)
+        )  # without a risk, no path is refused
 
     found = planner.evaluate(best, mean, x0=x0)
     if draws is not None:
@@ -138,7 +140,7 @@ def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Cell]) -> f
     return float(value) - problem.failure_along(path)
 
 
-def _infeasible(problem: Problem, risk: Risk) -> InfeasibleError:
+def _infeasible(problem: Problem, risk: BoundRisk | Risk) -> InfeasibleError:
     """Return an error with the safest path, because no path respects `max_failure`."""
     safest = min(every_path(problem.paths), key=risk.failure)
     p_fail = risk.failure(safest)

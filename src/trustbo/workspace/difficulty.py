@@ -6,167 +6,295 @@ depend on the next move. The measure of a bound with its next move is the maximu
 the lead and of T2.
 
 In a bound, next moves with the same tilt share the steepest route, for example that of the lead.
-They pass or fail together, so they are one unit of the hazard model; see `Difficulty.unit`.
+They pass or fail together, so they are one unit of the hazard model; see `Measured.unit`.
+
+Only plans that depend on failures need the difficulty of all bounds. Bounds are therefore measured
+when they are first asked for.
 """
 
-from collections.abc import Sequence
+import math
+from functools import cached_property
 from itertools import batched
-from typing import NamedTuple
-from weakref import WeakKeyDictionary
+from typing import NamedTuple, cast
 
 import numpy as np
-import xarray as xr
 from scipy import ndimage
 
-from trustbo.parallel import in_order
-from trustbo.team import Robot
-from trustbo.workspace import Workspace
-from trustbo.workspace.moves import END, MOVES, NEXT_NAMES, possible_next
-from trustbo.workspace.posts import TRAVERSABLE, Posts
-from trustbo.workspace.pursuit import largest_tilt
-from trustbo.workspace.surface import Surface
+from trustbo.display import bar, compiling
+from trustbo.kernels import kernel, part
+from trustbo.parallel import in_order, plain
+from trustbo.workspace.moves import END, MOVES, possible_next
+from trustbo.workspace.posts import Posts
+from trustbo.workspace.pursuit import Driving, tilt_along
+from trustbo.workspace.routes import SLACK, same_way, search
 
 MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
-"""Measures of difficulty; see `difficulty_of`."""
-_TILT = MEASURES.index("tilt")
+"""Measures of difficulty; see `Difficulty`."""
+TILT = "tilt"
+"""Name of the measure that is compared with the robots' slope limit."""
 _WIDTH = 2.0  # distance to an impassable pixel at which narrowness is 0.5, m
 _UNKNOWN = 0.5  # difficulty of routes without known traversability
 _BESIDE = 1.001  # pixels; a route this close to an impassable pixel is beside it
 _MOST = 2.0  # largest value of the measure tilt
 _TIGHT = 3.0  # log(1 + length in m) at which tightness is 1: 19 m
-_BLOCK = 16  # bounds per task of a thread
+_BLOCK = 64  # bounds per task of a thread
+_PATIENCE = 2.0  # seconds of work before a progress bar appears
 _NONE = -1  # unit of a bound that does not exist
+_compiled = kernel()
+_part = part()
 
 
-class Difficulty(NamedTuple):
-    """Difficulty of the bounds of a workspace, with each next move.
+class Measured(NamedTuple):
+    """Difficulty of bounds with each next move."""
 
-    Attributes:
-        measures: DataArray (move, row, col, next_move, measure), NaN where there is no bound or no
-            next bound. Without a terrain, the dimension `measure` has length 0.
-        unit: Index of the first next move of the same bound that has the same tilt, shape (move,
-            row, col, next_move); -1 where there is no bound. Without a terrain, all next moves of a
-            bound are one unit.
-    """
-
-    measures: xr.DataArray
+    values: np.ndarray
+    """Measures, shape (..., next_move, measure), NaN where there is no bound or no next bound.
+    Without a terrain, there are no measures."""
     unit: np.ndarray
+    """Index of the first next move of the same bound that has the same tilt, shape (...,
+    next_move); -1 where there is no bound or no next bound. Without a terrain, all next moves of a
+    bound are one unit."""
 
 
-_cached: WeakKeyDictionary[Workspace, Difficulty] = WeakKeyDictionary()
-
-
-def difficulty_of(workspace: Workspace) -> Difficulty:
-    """Compute the difficulty of a workspace's bounds; the result is cached.
+class Difficulty:
+    """Difficulty of the bounds of a workspace, measured when it is first asked for.
 
     `untraversable` is one minus the mean traversability of a route's pixels, or 0.5 if unknown.
     `tilt` is the largest tangent of pitch or roll on the curve that a robot drives along the route
-    (see `pursuit.largest_tilt`), divided by the tangent of `max_slope`; it is at most 2.
-    `narrowness` is 1 / (1 + w / 2 m), where w is the smallest distance to an impassable pixel.
-    `tightness` is log(1 + l / 1 m) / 3, where l is the length of the route beside impassable
-    pixels. All measures are averaged over the next moves of a unit, which have the same tilt.
+    (see `pursuit.tilt_along`), divided by the tangent of `max_slope`; it is at most 2. `narrowness`
+    is 1 / (1 + w / 2 m), where w is the smallest distance to an impassable pixel. `tightness` is
+    log(1 + l / 1 m) / 3, where l is the length of the route beside impassable pixels. All measures
+    are averaged over the next moves of a unit, which have the same tilt.
+
+    Attributes:
+        exists: Whether each bound exists and can be followed by the next move, shape (move, row,
+            col, next_move).
+        measures: Names of the measures; none without a terrain.
     """
-    if workspace not in _cached:
-        exists = possible_next(workspace.passable_bounds.values)
-        posts = workspace.posts
-        names = () if posts is None else MEASURES
 
-        values = np.full((*exists.shape, len(names)), np.nan)
-        unit = np.where(exists, exists.argmax(-1)[..., None], _NONE)
-        if posts is not None:
-            _measure(workspace, posts, exists, values)
-            unit = _units_of(values[..., _TILT], exists)
-            _average(values, unit)
+    def __init__(
+        self,
+        bounds: np.ndarray,
+        posts: Posts | None,
+        traversability: np.ndarray | None = None,
+    ) -> None:
+        """Prepare the difficulty of bounds.
 
-        bounds = workspace.passable_bounds
-        coords = {**bounds.coords, "next_move": list(NEXT_NAMES), "measure": list(names)}
-        dims = *bounds.dims, "next_move", "measure"
-        measures = xr.DataArray(values, coords, dims, "difficulty")
-        _cached[workspace] = Difficulty(measures, unit)
-    return _cached[workspace]
+        Args:
+            bounds: Whether each bound exists, shape (move, row, col).
+            posts: The robots' posts and routes; None without a terrain.
+            traversability: Traversability of each pixel, shape (row, col); None if unknown.
+        """
+        self.exists = possible_next(bounds)
+        self.measures = () if posts is None else MEASURES
+        self._posts = posts
+        self._traversability = traversability
+
+        unit = np.where(self.exists, self.exists.argmax(-1)[..., None], _NONE)
+        self._maps = Measured(np.full((*unit.shape, len(self.measures)), np.nan), unit)
+        self._is_measured = np.full(bounds.shape, posts is None)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all bounds are measured."""
+        return bool(self._is_measured[self.exists.any(-1)].all())
+
+    def of(self, bounds: np.ndarray) -> Measured:
+        """Return the difficulty of bounds (bound, 3), given by move, row and column."""
+        index = tuple(bounds.T)
+        missing = ~self._is_measured[index] & self.exists[index].any(-1)
+        if missing.any():
+            self._measure(np.unique(bounds[missing], axis=0))
+        return Measured(self._maps.values[index], self._maps.unit[index])
+
+    def whole(self) -> Measured:
+        """Return the difficulty of all bounds, shape (move, row, col, next_move[, measure])."""
+        self.of(np.argwhere(self.exists.any(-1)))
+        return self._maps
+
+    def restore(self, measured: Measured) -> None:
+        """Use the result of `whole` for the same workspace, instead of measuring again."""
+        if measured.values.shape != self._maps.values.shape:
+            raise ValueError("the difficulty is that of another workspace")
+        self._maps = measured
+        self._is_measured[:] = True
+
+    def _measure(self, bounds: np.ndarray) -> None:
+        """Measure the given bounds (bound, 3), which exist and have a terrain."""
+        blocks = [np.array(block) for block in batched(bounds, _BLOCK)]
+        shown = {"desc": "difficulty of bounds", "unit": "bound", "total": len(bounds)}
+        with compiling(), bar(True, delay=_PATIENCE, leave=False, **shown) as progress:
+            measured = in_order(self._of_block, blocks)
+            for block, values in zip(blocks, measured, strict=True):
+                index = tuple(block.T)
+                unit = _units_of(values[..., MEASURES.index(TILT)], self.exists[index])
+                self._maps.values[index] = _averaged(values, unit)
+                self._maps.unit[index] = unit
+                self._is_measured[index] = True  # last, for other threads
+                progress.update(len(block))
+
+    def _of_block(self, bounds: np.ndarray) -> np.ndarray:
+        """Compute the measures of bounds (bound, 3) before averaging, (bound, next_move, measure).
+
+        The route of a robot leads from one position to up to nine others.
+        """
+        posts = cast("Posts", self._posts)
+        surface = posts.surface
+        exists = self.exists[*bounds.T]
+        n_robots = len(posts.team.robots)
+
+        windows = np.empty((len(bounds), 4), int)
+        starts = np.empty((1 + n_robots, len(bounds), 2))
+        goals = np.full((1 + n_robots, *exists.shape, 2), np.nan)
+        for k, (move, row, col) in enumerate(bounds.tolist()):
+            a = row - MOVES[move][0], col - MOVES[move][1]
+            c = row, col
+            windows[k] = posts.window(a, c)
+            starts[0, k] = posts.stop(a)
+            goals[0, k] = posts.stop(c)
+            starts[1:, k] = posts.watching(a, c)
+            for n in np.flatnonzero(exists[k]).tolist():
+                onward = None if n == END else (c[0] + MOVES[n][0], c[1] + MOVES[n][1])
+                goals[1:, k, n] = posts.watching(c, onward)
+
+        rasters = self._easy, self._room, surface.gradient
+        place = surface.pixel, surface.origin
+        robots = posts.team.lead, *posts.team.robots
+        worst = np.zeros((*exists.shape, len(MEASURES)))
+        for robot, start, goal in zip(robots, starts, goals, strict=True):
+            from_pixel = np.stack(surface.nearest(*start.T), axis=-1)
+            to_pixel = np.stack(surface.nearest(*np.moveaxis(goal, -1, 0)), axis=-1)
+            ways = (start, from_pixel), (goal, to_pixel)
+            pace = posts.routes.pace(robot.max_slope)
+            of_robot = _of_robot(pace, rasters, place, Driving.of(robot), windows, *ways, exists)
+            worst = np.fmax(worst, of_robot)  # NaN where the robot has no route
+        worst[~exists] = np.nan
+        return worst
+
+    @cached_property
+    def _easy(self) -> np.ndarray:
+        """Traversability of each pixel, NaN where unknown."""
+        if self._traversability is not None:
+            return plain(self._traversability)
+        return np.full(self._room.shape, np.nan)
+
+    @cached_property
+    def _room(self) -> np.ndarray:
+        """Distance of each pixel to the nearest impassable one, m; inf if there is none."""
+        surface = cast("Posts", self._posts).surface
+        if surface.passable.all():
+            return np.full(surface.ground.shape, np.inf)
+        return np.asarray(ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel))
 
 
-def _measure(workspace: Workspace, posts: Posts, exists: np.ndarray, out: np.ndarray) -> None:
-    """Write the measures of existing bounds to `out`, (move, row, col, next_move, measure)."""
-    surface = posts.surface
-    pixels = workspace.pixels
+@_compiled
+def _of_robot(pace, rasters, place, driving, windows, starts, goals, exists):
+    """Compute the measures of a robot's routes in bounds, shape (bound, next_move, measure).
 
-    room = np.full(surface.ground.shape, np.inf)  # distance to the nearest impassable pixel, m
-    if not surface.passable.all():
-        room = np.asarray(ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel))
+    Args:
+        pace: Inverse of the robot's speed on each pixel; see `Routes.pace`.
+        rasters: Traversability, distance to impassable pixels, and gradient of each pixel.
+        place: Size of a pixel, and position of the centre of pixel (0, 0).
+        driving: Parameters of the robot.
+        windows: Pixel window of each bound, shape (bound, 4).
+        starts: Positions from which the routes lead, shape (bound, 2), and their pixels.
+        goals: Positions to which the routes lead, shape (bound, next_move, 2), and their pixels.
+        exists: Whether a bound can be followed by each next move, shape (bound, next_move).
 
-    easy = np.full(room.shape, np.nan)
-    if pixels is not None and TRAVERSABLE in pixels:
-        easy = pixels[TRAVERSABLE].values
-
-    def work(block: Sequence[list[int]]) -> None:
-        for m, row, col in block:
-            down, right = MOVES[m]
-            left = row - down, col - right
-            follows = np.flatnonzero(exists[m, row, col]).tolist()
-            measured: dict[tuple[int, bytes], np.ndarray] = {}  # keyed by the robot and its route
-            for n in follows:
-                onward = None if n == END else (row + MOVES[n][0], col + MOVES[n][1])
-                routes = posts.bound_routes(left, (row, col), onward)
-                out[m, row, col, n] = _of_bound(posts, easy, room, routes, measured)
-
-    for _ in in_order(work, batched(np.argwhere(exists.any(-1)).tolist(), _BLOCK)):
-        pass
-
-
-def _of_bound(
-    posts: Posts,
-    easy: np.ndarray,
-    room: np.ndarray,
-    routes: Sequence[np.ndarray | None],
-    measured: dict[tuple[int, bytes], np.ndarray],
-) -> np.ndarray:
-    """Compute the maximum of each measure over the robots' routes in a bound, shape (measure,).
-
-    `measured` keeps the measures of each robot's routes, because next moves share many of them.
+    Returns:
+        The measures; NaN where there is no next move or no route.
     """
-    robots = posts.team.lead, *posts.team.robots
+    start, from_pixel = starts
+    goal, to_pixel = goals
+    pixel, _ = place
+    measured = np.full((*exists.shape, 4), np.nan)
 
-    worst = np.zeros(len(MEASURES))
-    for i, (robot, route) in enumerate(zip(robots, routes, strict=True)):
-        if route is None:
-            continue
-        key = i, route.tobytes()
-        if key not in measured:
-            measured[key] = _of_route(posts.surface, easy, room, robot, route)
-        worst = np.maximum(worst, measured[key])
-    return worst
+    for b in range(len(exists)):
+        top, bottom, left, right = windows[b]
+        within = pace[top:bottom, left:right].copy()
+        nexts = np.flatnonzero(exists[b])
+        ends = np.empty((len(nexts), 2), np.int64)
+        for k in range(len(nexts)):
+            ends[k, 0] = to_pixel[b, nexts[k], 0] - top
+            ends[k, 1] = to_pixel[b, nexts[k], 1] - left
+
+        begin = from_pixel[b, 0] - top, from_pixel[b, 1] - left
+        best, came = search(within, pixel, begin, ends, SLACK)
+        for k in range(len(nexts)):
+            n = nexts[k]
+            same = -1
+            for other in nexts[:k]:  # next moves share many routes
+                if goal[b, n, 0] == goal[b, other, 0] and goal[b, n, 1] == goal[b, other, 1]:
+                    same = other
+            if same >= 0:
+                for m in range(measured.shape[2]):
+                    measured[b, n, m] = measured[b, same, m]
+                continue
+
+            way = same_way(within, pixel, best, came, begin, (ends[k, 0], ends[k, 1]))
+            if len(way) > 0:
+                across = start[b], goal[b, n]
+                _of_way(way, (top, left), across, rasters, place, driving, measured[b, n])
+    return measured
 
 
-def _of_route(
-    surface: Surface, easy: np.ndarray, room: np.ndarray, robot: Robot, route: np.ndarray
-) -> np.ndarray:
-    """Compute the measures of one robot's route, shape (measure,)."""
-    pixels = surface.nearest(*route.T)
-    of_route = easy[pixels]
-    gaps = room[pixels]
-    of_route = of_route[np.isfinite(of_route)]
-    tight = (gaps <= _BESIDE * max(surface.pixel)).sum() * min(surface.pixel)
+@_part
+def _of_way(way, corner, across, rasters, place, driving, out):
+    """Write the measures of a robot's route to `out` (measure,).
 
-    return np.array([
-        1.0 - of_route.mean() if len(of_route) else _UNKNOWN,
-        min(largest_tilt(surface, robot, route) / np.tan(robot.max_slope), _MOST),
-        1.0 / (1.0 + gaps.min() / _WIDTH),
-        np.log1p(tight) / _TIGHT,
-    ])  # fmt: skip
+    Args:
+        way: Pixels of the route, shape (point, 2), in a window that begins at the pixel `corner`.
+        corner: Row and column.
+        across: First and last position of the route.
+        rasters: See `_of_robot`.
+        place: See `_of_robot`.
+        driving: Parameters of the robot.
+        out: Measures.
+    """
+    easy, room, gradient = rasters
+    pixel, origin = place
+    max_slope = driving[3]
+
+    n = max(len(way), 2)  # a route within a pixel has two points
+    route = np.empty((n, 2))
+    known = 0
+    total = 0.0
+    gap = np.inf
+    n_beside = 0
+    for k in range(n):
+        r = way[min(k, len(way) - 1), 0] + corner[0]
+        c = way[min(k, len(way) - 1), 1] + corner[1]
+        route[k, 0] = origin[0] + c * pixel[1]
+        route[k, 1] = origin[1] - r * pixel[0]
+        if math.isfinite(easy[r, c]):
+            known += 1
+            total += easy[r, c]
+        gap = min(gap, room[r, c])
+        n_beside += room[r, c] <= _BESIDE * max(pixel[0], pixel[1])
+
+    for axis in range(2):
+        route[0, axis] = across[0][axis]
+        route[n - 1, axis] = across[1][axis]
+
+    tilt = tilt_along(gradient, pixel, origin, route, driving)
+    out[0] = 1.0 - total / known if known > 0 else _UNKNOWN
+    out[1] = min(tilt / math.tan(max_slope), _MOST)
+    out[2] = 1.0 / (1.0 + gap / _WIDTH)
+    out[3] = math.log1p(n_beside * min(pixel[0], pixel[1])) / _TIGHT
 
 
 def _units_of(tilt: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Return the first next move with the same tilt, (move, row, col, next_move); -1 if none."""
+    """Return the first next move with the same tilt, (bound, next_move); -1 if none."""
     same = tilt[..., None, :] == tilt[..., None]  # NaN equals nothing
     return np.where(exists, same.argmax(-1), _NONE)
 
 
-def _average(values: np.ndarray, unit: np.ndarray) -> None:
-    """Replace the measures (move, row, col, next_move, measure) by their means over each unit."""
+def _averaged(values: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Return the measures (bound, next_move, measure) as means over each unit."""
+    means = values.copy()
     for n in range(unit.shape[-1]):
         member = unit == n
-        alone = member[..., None] & np.isfinite(values)
-        count = np.maximum(alone.sum(-2, keepdims=True), 1)
-        mean = np.where(alone, values, 0.0).sum(-2, keepdims=True) / count
-        values[member] = np.broadcast_to(mean, values.shape)[member]
+        count = np.maximum(member.sum(-1), 1)[:, None]
+        mean = np.where(member[..., None], values, 0.0).sum(-2) / count
+        means[member] = np.broadcast_to(mean[:, None], values.shape)[member]
+    return means

@@ -6,6 +6,7 @@ route.
 """
 
 import math
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from trustbo.kernels import kernel, part
 from trustbo.team import Robot
 from trustbo.terrain.pixels import nearest_pixel
 from trustbo.workspace.routes import SLOWEST, speed_share
-from trustbo.workspace.surface import Surface
 
 ARRIVED = 0.5
 """Distance in m from the goal at which a robot stops."""
@@ -28,7 +28,7 @@ _LEAST_STEPS = 5
 _SLIP = 0.05
 """Standard deviation of the log of the factor by which wheel slip multiplies the speed."""
 _TICK = 0.5
-"""Length of a tick of `largest_tilt`, s."""
+"""Length of a tick of `tilt_along`, s."""
 _compiled = kernel()
 _part = part()
 
@@ -50,30 +50,6 @@ def _within_a_turn(angle):
     if -math.pi <= angle < math.pi:
         return angle
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-def largest_tilt(surface: Surface, robot: Robot, route: np.ndarray) -> float:
-    """Compute the largest tangent of pitch or roll on the curve that a robot drives.
-
-    There is no wheel slip, and the robot faces its route at the start. The result is inf if the
-    curve leaves the pixels with known slopes.
-    """
-    to_next = route[min(1, len(route) - 1)] - route[0]
-    length = float(np.hypot(*np.diff(route, axis=0).T).sum())
-    slowest = SLOWEST * robot.speed
-    n_ticks = math.ceil((length / slowest + 2.0 * math.pi / robot.turn_rate) / _TICK)
-    _, _, largest = pursue(
-        surface.gradient,
-        surface.pixel,
-        surface.origin,
-        route,
-        math.atan2(to_next[1], to_next[0]),
-        (robot.speed, robot.turn_rate, robot.lookahead, robot.max_slope, math.inf),
-        _TICK,
-        steps_per_tick(robot, _TICK),
-        np.zeros(n_ticks),
-    )
-    return largest
 
 
 @_compiled
@@ -145,3 +121,40 @@ def pursue(gradient, pixel, origin, route, heading, limits, tick, n_steps, slip)
 
         poses[k, 0], poses[k, 1], poses[k, 2] = x, y, heading
     return poses, TIMEOUT, largest
+
+
+class Driving(NamedTuple):
+    """A robot's parameters, as `tilt_along` needs them."""
+
+    speed: float
+    turn_rate: float
+    lookahead: float
+    max_slope: float
+    n_steps: int
+
+    @classmethod
+    def of(cls, robot: Robot) -> Self:
+        """Return the parameters of a robot."""
+        n_steps = steps_per_tick(robot, _TICK)
+        return cls(robot.speed, robot.turn_rate, robot.lookahead, robot.max_slope, n_steps)
+
+
+@_compiled
+def tilt_along(gradient, pixel, origin, route, driving):
+    """Compute the largest tangent of pitch or roll on the curve that a robot drives.
+
+    There is no wheel slip, and the robot faces its route at the start. The result is inf if the
+    curve leaves the pixels with known slopes.
+    """
+    speed, turn_rate, lookahead, max_slope, n_steps = driving
+    length = 0.0
+    for k in range(1, len(route)):
+        length += math.hypot(route[k, 0] - route[k - 1, 0], route[k, 1] - route[k - 1, 1])
+
+    second = min(1, len(route) - 1)
+    heading = math.atan2(route[second, 1] - route[0, 1], route[second, 0] - route[0, 0])
+    n_ticks = math.ceil((length / (SLOWEST * speed) + 2.0 * math.pi / turn_rate) / _TICK)
+    limits = speed, turn_rate, lookahead, max_slope, math.inf
+    no_slip = np.zeros(n_ticks)
+    _, _, largest = pursue(gradient, pixel, origin, route, heading, limits, _TICK, n_steps, no_slip)
+    return largest

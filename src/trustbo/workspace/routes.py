@@ -24,6 +24,8 @@ SLOWEST = 0.1
 """Speed at the slope limit as a fraction of the speed on level ground."""
 _CLEARANCE = 1.0  # preferred distance from obstacles, because robots stray from routes, m
 _TIE = 1e-9  # m on level ground; costs that differ by less are equal up to rounding
+SLACK = 2.0 * _TIE
+"""Slack of a `search` that finds all ways that are as fast as the fastest one."""
 _CLOSE = 4.0  # factor on the cost of a route that is closer to an obstacle
 _compiled = kernel()
 _part = part()
@@ -33,9 +35,8 @@ class Routes:
     """Fastest routes over passable pixels, found by A* and cached."""
 
     def __init__(self, surface: Surface) -> None:
-        """Compute the slope of each pixel, and find the pixels near obstacles."""
+        """Find the pixels near obstacles."""
         self._surface = surface
-        self._slope = surface.slope
 
         free: Any = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
         self._is_close = free <= max(_CLEARANCE, *surface.pixel)
@@ -67,19 +68,25 @@ class Routes:
         route[-1] = goal
         return route
 
+    def pace(self, max_slope: float) -> np.ndarray:
+        """Return the inverse of the speed on each pixel (row, col); infinite where impassable.
+
+        Speed is relative to level ground. Pixels near obstacles have a larger pace.
+        """
+        if max_slope not in self._paces:
+            pace = 1.0 / speed_share(self._surface.slope, max_slope)
+            pace = np.where(self._is_close, _CLOSE * pace, pace)
+            self._paces[max_slope] = np.where(self._surface.passable, pace, np.inf)
+        return self._paces[max_slope]
+
     def _search(
         self, start: tuple[int, int], goal: tuple[int, int], window: Window, max_slope: float
     ) -> np.ndarray:
         """Find the pixels of a route, and return their positions; empty if there is no route."""
         surface = self._surface
-        if max_slope not in self._paces:
-            pace = 1.0 / speed_share(self._slope, max_slope)
-            pace = np.where(self._is_close, _CLOSE * pace, pace)
-            self._paces[max_slope] = np.where(surface.passable, pace, np.inf)
-
         top, bottom, left, right = window
         pixels = a_star(
-            plain(self._paces[max_slope][top:bottom, left:right]),
+            plain(self.pace(max_slope)[top:bottom, left:right]),
             surface.pixel,
             (start[0] - top, start[1] - left),
             (goal[0] - top, goal[1] - left),
@@ -96,41 +103,93 @@ def speed_share(tilt, max_slope):
 
 
 @_part
-def _shortest(rows, cols, pixel):
-    """Compute the length of the shortest way over a number of rows and columns of pixels.
+def _away(r, c, box, pixel, diagonal):
+    """Compute the length of the shortest way from a pixel to a rectangle of pixels.
 
-    A way leads from a pixel to one of its 8 neighbours, so it is longer than a straight line.
+    A way leads from a pixel to one of its 8 neighbours, so it is longer than a straight line. `box`
+    contains the first and the last row, and the first and the last column. `diagonal` is that of a
+    pixel.
     """
-    down = abs(rows)
-    right = abs(cols)
-    diagonal = min(down, right)
-    straight = (down - diagonal) * pixel[0] + (right - diagonal) * pixel[1]
-    return diagonal * math.hypot(pixel[0], pixel[1]) + straight
+    down = max(box[0] - r, 0, r - box[1])
+    right = max(box[2] - c, 0, c - box[3])
+    n_diagonal = min(down, right)
+    straight = (down - n_diagonal) * pixel[0] + (right - n_diagonal) * pixel[1]
+    return n_diagonal * diagonal + straight
 
 
-@_compiled
-def a_star(pace, pixel, start, goal):
-    """Find the pixels of the fastest route by A* (Hart, Nilsson and Raphael 1968).
+@_part
+def _step(dr, dc, pixel, diagonal):
+    """Return the distance from a pixel to one of its 8 neighbours."""
+    if dr != 0 and dc != 0:
+        return diagonal
+    return pixel[0] if dr != 0 else pixel[1]
 
-    `pace` is infinite where impassable.
+
+@_part
+def _mark(goals, is_goal):
+    """Mark the goals inside the mask; return their number and the rectangle around them."""
+    rows, cols = is_goal.shape
+    n = 0
+    box = rows, 0, cols, 0
+    for k in range(len(goals)):
+        r = goals[k, 0]
+        c = goals[k, 1]
+        if 0 <= r < rows and 0 <= c < cols and not is_goal[r, c]:
+            is_goal[r, c] = True
+            n += 1
+            box = min(box[0], r), max(box[1], r), min(box[2], c), max(box[3], c)
+    return n, box
+
+
+@_part
+def search(pace, pixel, start, goals, slack):
+    """Find the fastest ways from a pixel to other pixels by A* (Hart, Nilsson and Raphael 1968).
+
+    The estimate of the way ahead is that to the rectangle around the goals. It is admissible and
+    consistent.
+
+    Args:
+        pace: Inverse of the speed on each pixel (row, col); infinite where impassable.
+        pixel: Height and width of a pixel, m.
+        start: Row and column.
+        goals: Rows and columns, shape (goal, 2).
+        slack: Amount by which the cost of a way may exceed that of the farthest goal, so that the
+            search continues; if it is 0, the search ends at the farthest goal.
+
+    Returns:
+        The least cost to each pixel, inf if it was not reached, and the flat index of the previous
+        pixel on the way, -1 at the start.
     """
     rows, cols = pace.shape
     best = np.full((rows, cols), np.inf)
     came = np.full((rows, cols), -1)
     least = pace.min()
+    diagonal = math.hypot(pixel[0], pixel[1])
 
-    for r, c in (start, goal):
-        if not (0 <= r < rows and 0 <= c < cols):
-            return np.empty((0, 2), np.int64)
+    is_goal = np.zeros((rows, cols), np.bool_)
+    n_left, box = _mark(goals, is_goal)
+    if n_left == 0 or not (0 <= start[0] < rows and 0 <= start[1] < cols):
+        return best, came
 
     best[start] = 0.0
-    queue = [(0.0, start[0], start[1])]
+    limit = np.inf
+    queue = [(0.0, start[0] * cols + start[1])]
     while queue:
-        estimate, r, c = heapq.heappop(queue)
-        if (r, c) == goal:
+        estimate, flat = heapq.heappop(queue)
+        if estimate > limit:
             break
+        r = flat // cols
+        c = flat % cols
 
-        ahead = _shortest(goal[0] - r, goal[1] - c, pixel) * least  # an admissible estimate
+        if is_goal[r, c]:
+            is_goal[r, c] = False
+            n_left -= 1
+            if n_left == 0:
+                limit = estimate + slack
+                if slack == 0.0:
+                    break
+
+        ahead = _away(r, c, box, pixel, diagonal) * least
         if estimate > best[r, c] + ahead + _TIE:
             continue  # a stale entry: a faster way to the pixel was found
         for dr in range(-1, 2):
@@ -143,16 +202,22 @@ def a_star(pace, pixel, start, goal):
                 if not (np.isfinite(pace[i, c]) and np.isfinite(pace[r, j])):
                     continue
 
-                length = math.hypot(dr * pixel[0], dc * pixel[1])
+                length = _step(dr, dc, pixel, diagonal)
                 cost = best[r, c] + 0.5 * (pace[r, c] + pace[i, j]) * length
 
                 if cost < best[i, j]:
                     best[i, j] = cost
-                    came[i, j] = r * cols + c
-                    rest = _shortest(goal[0] - i, goal[1] - j, pixel)
-                    heapq.heappush(queue, (cost + rest * least, i, j))
+                    came[i, j] = flat
+                    ahead = _away(i, j, box, pixel, diagonal) * least
+                    heapq.heappush(queue, (cost + ahead, i * cols + j))
+    return best, came
 
-    if not np.isfinite(best[goal]):
+
+@_part
+def way_to(best, came, goal):
+    """Return the pixels (point, 2) of the way that `search` found to a goal; empty if none."""
+    rows, cols = best.shape
+    if not (0 <= goal[0] < rows and 0 <= goal[1] < cols) or not np.isfinite(best[goal]):
         return np.empty((0, 2), np.int64)
 
     n = 1
@@ -168,6 +233,57 @@ def a_star(pace, pixel, start, goal):
         cells[k, 1] = cell % cols
         cell = came[cell // cols, cell % cols]
     return cells
+
+
+@_compiled
+def a_star(pace, pixel, start, goal):
+    """Find the pixels (point, 2) of the fastest way between two pixels; empty if there is none."""
+    best, came = search(pace, pixel, start, np.array([[goal[0], goal[1]]]), 0.0)
+    return way_to(best, came, goal)
+
+
+@_part
+def same_way(pace, pixel, best, came, start, goal):
+    """Return the way to one of the goals of a `search` with slack `SLACK`, as `Routes.find` does.
+
+    Equally fast ways differ by the order in which a search visits pixels. A way that is not the
+    only fastest one is therefore found again by `a_star`.
+    """
+    way = way_to(best, came, goal)
+    if _is_only_one(pace, pixel, best, way):
+        return way
+    if start <= goal:  # as in `Routes.find`
+        return a_star(pace, pixel, start, goal)
+    return a_star(pace, pixel, goal, start)[::-1].copy()
+
+
+@_part
+def _is_only_one(pace, pixel, best, way):
+    """Return whether no other way to the end of `way` is as fast, up to rounding.
+
+    `best` contains the cost of all pixels from which another way could lead to the end.
+    """
+    rows, cols = pace.shape
+    diagonal = math.hypot(pixel[0], pixel[1])
+    for k in range(1, len(way)):
+        r = way[k, 0]
+        c = way[k, 1]
+        for dr in range(-1, 2):
+            for dc in range(-1, 2):
+                i = r + dr
+                j = c + dc
+                if (dr == 0 and dc == 0) or not (0 <= i < rows and 0 <= j < cols):
+                    continue
+                if (i == way[k - 1, 0] and j == way[k - 1, 1]) or not np.isfinite(best[i, j]):
+                    continue
+                if not (np.isfinite(pace[i, c]) and np.isfinite(pace[r, j])):
+                    continue
+
+                length = _step(dr, dc, pixel, diagonal)
+                cost = best[i, j] + 0.5 * (pace[r, c] + pace[i, j]) * length
+                if cost <= best[r, c] + _TIE:
+                    return False
+    return True
 
 
 def at_times(

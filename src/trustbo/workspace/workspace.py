@@ -36,6 +36,7 @@ from trustbo.workspace.awareness import (
     unlabelled,
     with_line_of_sight,
 )
+from trustbo.workspace.difficulty import Difficulty
 from trustbo.workspace.grid import MAX_MISSING, Grid, Location
 from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds
 from trustbo.workspace.posts import TRAVERSABLE, Posts
@@ -257,6 +258,14 @@ class Workspace(Summary):
             exists = self.posts.linked_bounds(exists)
         like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
         return like.copy(data=exists).rename("passable_bounds")
+
+    @cached_property
+    def difficulty(self) -> Difficulty:
+        """Difficulty of the bounds, from the robots' routes; bounds are measured when needed."""
+        traversability = None
+        if self.pixels is not None and TRAVERSABLE in self.pixels:
+            traversability = self.pixels[TRAVERSABLE].values
+        return Difficulty(self.passable_bounds.values, self.posts, traversability)
 
     def along(self, path: Sequence[Cell], *, anywhere: bool = False) -> np.ndarray:
         """Return the awareness of a path's bounds, shape (bound, robot, feature), in [0, 1].
