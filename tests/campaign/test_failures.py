@@ -67,7 +67,34 @@ def test_hazard_is_that_of_all_missions_and_in_the_posterior(workspace):
     assert campaign.risk.mean[at(path[1:3])][END] > 2.0 * before
     alone = fit_hazard(campaign.missions, workspace, seed=campaign.state.seed_of("hazard"))
     assert alone.drop_attrs().identical(campaign.hazard.drop_attrs())
-    assert campaign.posterior["hazard"].to_dataset().identical(campaign.hazard)
+    kept = campaign.posterior["hazard"].to_dataset()
+    np.testing.assert_array_equal(kept["p_fail"].values, campaign.risk.mean)
+    assert kept.drop_vars("p_fail").identical(campaign.hazard)
+
+
+def test_only_attempted_and_planned_bounds_are_measured_until_failures_matter(tmp_path):
+    """Then all are, and a campaign that goes on in another process reads them from its folder."""
+    terrain = tb.terrain.synthetic_terrain((120.0, 120.0), 2.0, seed=2)
+    hilly = tb.Workspace.from_terrain(terrain, (5, 5), tb.Team(n_robots=1), bounds=False)
+    with begin(hilly, directory=tmp_path) as campaign:
+        plan = campaign.ask()
+        campaign.tell(ModelSimulator(hilly).run(plan.path, seed=0))
+        assert campaign.plan.p_arrive > 0.0
+        campaign.maps(n_draws=5)
+        assert not hilly.difficulty.is_whole
+        assert not tb.load_result(tmp_path).workspace.difficulty.is_whole
+
+        campaign.fail("stuck", where=campaign.ask().path[1])
+        campaign.ask()
+        assert hilly.difficulty.is_whole
+
+    with tb.Campaign.load(tmp_path) as again:
+        kept = again.workspace.difficulty
+        assert kept.is_whole
+        np.testing.assert_array_equal(kept.whole().values, hilly.difficulty.whole().values)
+        np.testing.assert_array_equal(kept.whole().unit, hilly.difficulty.whole().unit)
+        again.save(tmp_path / "copy")
+    assert tb.load_result(tmp_path / "copy").workspace.difficulty.is_whole
 
 
 def test_mission_without_a_report_is_learned_from_if_a_bound_failed(workspace):

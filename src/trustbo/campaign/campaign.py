@@ -779,7 +779,7 @@ class Campaign(Result):
                 raise TrustboError(f"policy {name!r} is not the campaign's, {given['policy']!r}.")
             campaign.state = state
             campaign._progress = progress
-            campaign._use(FolderStorage(lock, files))
+            campaign._use(FolderStorage(lock, files, workspace))
             if progress and pending:
                 n = len(state.entries) + len(pending)
                 say(f"fitting mission {n}, which was recorded but not used for learning")

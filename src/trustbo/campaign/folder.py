@@ -1,6 +1,7 @@
 """Folder of a campaign, with one file for each mission and one for each posterior.
 
     workspace.nc          written once
+    difficulty.nc         difficulty of all bounds, written once a plan has needed it
     earlier.nc            missions of earlier campaigns, if there are any; written once
     missions/0001.nc      measurements and plan of the first mission, written before learning
     posteriors/0001.nc    draws of the parameters after the first mission; 0000.nc contains those
@@ -24,6 +25,7 @@ import xarray as xr
 from trustbo.campaign.earlier import earlier_to_tree
 from trustbo.campaign.lock import FolderLock
 from trustbo.campaign.record import (
+    DIFFICULTY,
     EARLIER,
     RECORD,
     WORKSPACE,
@@ -55,7 +57,7 @@ from trustbo.files import (
 from trustbo.logs.netcdf import missions_to_tree, read_tree, tree_from_bytes, tree_to_bytes
 from trustbo.planning.plan import plan_to_record
 from trustbo.workspace import Workspace
-from trustbo.workspace.netcdf import workspace_to_tree
+from trustbo.workspace.netcdf import difficulty_to_tree, workspace_to_tree
 
 
 class FolderStorage:
@@ -67,12 +69,13 @@ class FolderStorage:
         files: Hash of each file of the campaign, keyed by its path in the folder.
     """
 
-    def __init__(self, lock: FolderLock, files: dict[str, str]) -> None:
-        """Use a locked folder that contains a campaign with these files."""
+    def __init__(self, lock: FolderLock, files: dict[str, str], workspace: Workspace) -> None:
+        """Use a locked folder that contains a campaign with these files in a workspace."""
         self.path = lock.path
         self.turn = lock.turn
         self.files = files
         self._lock = lock
+        self._workspace = workspace
         self._written = _version_of(self.path / RECORD)
 
     @classmethod
@@ -118,7 +121,7 @@ class FolderStorage:
                 files = _replace_campaign(lock.path, workspace, state)
             else:
                 files = _write_first(lock.path, workspace, state)
-            return cls(lock, files)
+            return cls(lock, files, workspace)
         except BaseException:
             # Another process may have made the folder, and written a campaign, in the meantime.
             if is_new and not has_campaign(path):
@@ -160,6 +163,10 @@ class FolderStorage:
                 posterior.file = self._write(name, tree_to_bytes(posterior.tree))
             if posterior is not state.last:
                 posterior.tree = None  # frees the memory
+
+        if DIFFICULTY not in self.files:
+            for name, content in _measured(self._workspace):
+                self._write(name, content)
 
         record = record_to_bytes(state, self.files)
         write_file(self.path / RECORD, record, make_folder=False)
@@ -205,6 +212,7 @@ def _entry_to_tree(entry: Entry) -> xr.DataTree:
 def _contents(workspace: Workspace, state: State) -> Iterator[tuple[str, bytes]]:
     """Make the files of a campaign, except campaign.json: path in the folder, and content."""
     yield WORKSPACE, tree_to_bytes(workspace_to_tree(workspace))
+    yield from _measured(workspace)
     if state.earlier.missions:
         yield EARLIER, tree_to_bytes(earlier_to_tree(state.earlier))
 
@@ -213,6 +221,12 @@ def _contents(workspace: Workspace, state: State) -> Iterator[tuple[str, bytes]]
     posteriors = {posterior.name: posterior for posterior in state.stored}
     for name, posterior in posteriors.items():
         yield posterior_file(name), _content_of(posterior)
+
+
+def _measured(workspace: Workspace) -> Iterator[tuple[str, bytes]]:
+    """Make the file of the difficulty of bounds, if all of them have been measured."""
+    if workspace.posts is not None and workspace.difficulty.is_whole:
+        yield DIFFICULTY, tree_to_bytes(difficulty_to_tree(workspace.difficulty))
 
 
 def _content_of(posterior: Posterior) -> bytes:

@@ -7,6 +7,7 @@ from trustbo.campaign.earlier import earlier_from_tree
 from trustbo.campaign.learning import as_learned
 from trustbo.campaign.lock import FolderLock
 from trustbo.campaign.record import (
+    DIFFICULTY,
     EARLIER,
     RECORD,
     WORKSPACE,
@@ -23,7 +24,7 @@ from trustbo.files import FilePath, interpreting, read_file, to_path
 from trustbo.logs.netcdf import missions_from_tree, read_tree
 from trustbo.planning.plan import plan_from_record
 from trustbo.workspace import Workspace
-from trustbo.workspace.netcdf import workspace_from_tree
+from trustbo.workspace.netcdf import restore_difficulty, workspace_from_tree
 
 
 def lock_campaign(directory: FilePath) -> FolderLock:
@@ -78,6 +79,11 @@ def read_campaign(
     tree = read_tree(folder / WORKSPACE, files.get(WORKSPACE, ""))
     with interpreting(folder / WORKSPACE):
         workspace = workspace_from_tree(tree)
+    if DIFFICULTY in files:
+        tree = read_tree(folder / DIFFICULTY, files[DIFFICULTY])
+        with interpreting(folder / DIFFICULTY):
+            restore_difficulty(workspace, tree)
+
     with interpreting(path):
         state = state_from_record(record, workspace)
     state.initial = None if initial is None else stored[initial]

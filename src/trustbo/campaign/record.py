@@ -16,6 +16,8 @@ from trustbo.workspace import Workspace
 
 RECORD = "campaign.json"
 WORKSPACE = "workspace.nc"
+DIFFICULTY = "difficulty.nc"
+"""File of the difficulty of all bounds, if a plan has needed it."""
 EARLIER = "earlier.nc"
 """File of the missions of earlier campaigns, if there are any."""
 MISSIONS = "missions"

@@ -9,7 +9,9 @@ import xarray as xr
 from trustbo.files import to_json
 from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
+from trustbo.workspace.difficulty import Difficulty, Measured
 from trustbo.workspace.grid import Grid
+from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import surface_of
@@ -79,6 +81,22 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
     return Workspace(
         cells["awareness"], cells["passable"], grid, team, terrain, pixels, composites, posts
     )
+
+
+def difficulty_to_tree(difficulty: Difficulty) -> xr.DataTree:
+    """Convert the difficulty of all bounds to a data tree."""
+    values, unit = difficulty.whole()
+    bounds = "move", "row", "col", "next_move"
+    names = {"move": list(MOVE_NAMES), "next_move": list(NEXT_NAMES)}
+    maps = {"difficulty": ((*bounds, "measure"), values), "unit": (bounds, unit.astype(np.int8))}
+    return xr.DataTree(xr.Dataset(maps, names | {"measure": list(difficulty.measures)}))
+
+
+def restore_difficulty(workspace: Workspace, tree: xr.DataTree) -> None:
+    """Give a workspace its difficulty, from a tree made by `difficulty_to_tree`."""
+    maps = tree.to_dataset()
+    measured = Measured(maps["difficulty"].values, maps["unit"].values.astype(int))
+    workspace.difficulty.restore(measured)
 
 
 def _is_storable(value: object) -> bool:
