@@ -1,6 +1,7 @@
 """Composite index in [0, 1]: the first principal component of several features."""
 
 from collections.abc import Mapping
+from functools import reduce
 from typing import Self
 
 import numpy as np
@@ -56,12 +57,14 @@ class CompositeIndex:
         Raises:
             TrustboError: A declared feature is missing, or no sample has all features.
         """
-        x = np.stack([column.ravel() for column in self._columns(features)], axis=1)
-        x = x[np.isfinite(x).all(1)]
-        if not len(x):
+        columns = self._columns(features)
+        known = np.flatnonzero(reduce(np.logical_and, map(np.isfinite, columns)))
+        if not len(known):
             raise TrustboError(f"no pixel has all of the features {', '.join(self.signs)}.")
 
-        x = x[:: -(-len(x) // MAX_PIXELS)]
+        known = known[:: -(-len(known) // MAX_PIXELS)]
+        x = np.stack([column.ravel()[known] for column in columns], axis=1)
+        del known
         low, high = np.percentile(x, _WINSORISED, axis=0)
         x = np.clip(x, low, high)
 

@@ -6,6 +6,7 @@ for composites, as in the example in `docs/terrain.md`.
 """
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -197,8 +198,8 @@ def slope(terrain: xr.Dataset) -> np.ndarray:
 @feature("roughness", sign=-1)
 def roughness(terrain: xr.Dataset) -> np.ndarray:
     """Compute the range of ground heights in the 3 x 3 window, m (Wilson et al. 2007)."""
-    window = list(_window(terrain["dem"].values).values())
-    return np.maximum.reduce(window) - np.minimum.reduce(window)
+    window = _window(terrain["dem"].values).values()
+    return reduce(np.maximum, window) - reduce(np.minimum, window)
 
 
 @feature("tri", sign=-1)
@@ -212,7 +213,7 @@ def tri(terrain: xr.Dataset) -> np.ndarray:
 def step_height(terrain: xr.Dataset) -> np.ndarray:
     """Compute the largest step to one of the 8 neighbours, m; missing neighbours are ignored."""
     z = terrain["dem"].values
-    return np.maximum.reduce([np.abs(w - z) for w in _window(z).values()])
+    return reduce(np.maximum, (np.abs(w - z) for w in _window(z).values()))
 
 
 @feature("canopy_height", sign=-1)

@@ -4,6 +4,7 @@ Faulty rasters are rejected or corrected here: the rest of the package relies on
 NaN where missing, on a metric grid with north at the top.
 """
 
+import gc
 import math
 import re
 import warnings
@@ -39,6 +40,7 @@ from trustbo.terrain.place import (
 )
 
 MOST_PIXELS = 1e8  # per raster: about 3 GB while it is read
+_LARGE = 1_000_000  # pixels; intermediate rasters of a larger terrain are freed at once
 _CLIPPED = 0.02  # fraction of pixels with the surface below the ground that causes a warning
 _NOISE = 0.1  # m: a surface that is less than this below the ground is due to resampling
 _LOWEST = 0.02  # quantile of the canopy height that counts as its lowest value
@@ -105,6 +107,8 @@ def read_terrain(
         stored.append(_stored(dsm, "dsm"))
 
     terrain = _on_one_grid(stored, crs, nodata)
+    del stored
+    _free_rasters(terrain)
     if dsm is None:
         warn("no surface (DSM) is given, so no canopy is known: only the ground blocks sight.")
     else:
@@ -169,7 +173,19 @@ def require_terrain(terrain: xr.Dataset) -> xr.Dataset:
         )
 
     stored = [_stored_array(terrain[name], name) for name in ("dem", "dsm")]
-    return _on_one_grid(stored, crs).assign_attrs(terrain.attrs)
+    checked = _on_one_grid(stored, crs).assign_attrs(terrain.attrs)
+    del stored
+    _free_rasters(checked)
+    return checked
+
+
+def _free_rasters(terrain: xr.Dataset) -> None:
+    """Free the intermediate rasters of a large terrain.
+
+    The accessor `rio` of an array refers to the array, so only the garbage collector frees it.
+    """
+    if terrain["dem"].size >= _LARGE:
+        gc.collect()
 
 
 def check_size(shape: tuple[int, ...], name: str) -> None:
@@ -194,7 +210,7 @@ def _heights(array: xr.DataArray, given: object, nodata: float | None) -> xr.Dat
     coords = {axis: array[axis].values for axis in ("y", "x")}
     heights = xr.DataArray(values, coords, name=name, attrs={"datum": datum})
     heights = heights.sortby("y", ascending=False).sortby("x")
-    return placed(heights.rio.write_crs(horizontal(crs).to_string()), name)
+    return placed(heights.rio.write_crs(horizontal(crs).to_string(), inplace=True), name)
 
 
 def _stored(raster: FilePath | xr.DataArray, role: str) -> xr.DataArray:
@@ -290,7 +306,7 @@ def _of_file(file: DatasetReader, role: str, name: str) -> xr.DataArray:
     coords = {"y": t.f + rows * t.e, "x": t.c + cols * t.a}
 
     array = xr.DataArray(values, coords, ("y", "x"), attrs=attrs)
-    return array if file.crs is None else array.rio.write_crs(file.crs)
+    return array if file.crs is None else array.rio.write_crs(file.crs, inplace=True)
 
 
 def _band_of_heights(names: Sequence[str], role: str) -> int:
@@ -379,7 +395,7 @@ def _of_array(array: xr.DataArray, role: str, name: str) -> xr.DataArray:
 
     array = array.rename({y: "y", x: "x"}).assign_coords(y=rows, x=cols).rename(name)
     array = array.assign_attrs({ACCESSOR_FILL: fill})
-    return array if crs is None else array.rio.write_crs(crs)
+    return array if crs is None else array.rio.write_crs(crs, inplace=True)
 
 
 def _accessor_fill(array: xr.DataArray) -> float | None:
@@ -491,7 +507,7 @@ def _averaged(terrain: xr.Dataset, resolution: float) -> xr.Dataset:
 
 
 def _placed_on(terrain: xr.Dataset, crs: Any) -> xr.Dataset:
-    """Store the CRS, and the position and the size of the pixels in it."""
-    terrain = terrain.rio.write_crs(crs)
+    """Store the CRS, and the position and the size of the pixels in it, in a new terrain."""
+    terrain = terrain.rio.write_crs(crs, inplace=True)
     with quiet_affine():
-        return terrain.rio.write_transform(terrain.rio.transform(recalc=True))
+        return terrain.rio.write_transform(terrain.rio.transform(recalc=True), inplace=True)

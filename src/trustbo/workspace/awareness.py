@@ -82,11 +82,12 @@ def pixel_maps(
 
         names = require_kind(f"feature {name!r}", parts, Iterable, remedy)
         names = require_order(f"the parts of feature {name!r}", names)
-        values = {part: values_of(part) for part in names}
+        parts_of = {part: values_of(part) for part in names}
 
-        index = CompositeIndex({part: FEATURES[part].sign for part in values}).fit(values)
-        pixels[name] = index.transform(values)
+        index = CompositeIndex({part: FEATURES[part].sign for part in parts_of}).fit(parts_of)
+        pixels[name] = index.transform(parts_of)
         composites[name] = index
+        del parts_of  # rasters, which the next feature would otherwise add to
 
     dem = terrain["dem"]
     maps = {

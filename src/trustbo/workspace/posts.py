@@ -200,7 +200,8 @@ class Posts:
             position = self.surface.centers(row, col)
             size = np.hypot(self.grid.cell_height, self.grid.cell_width)
             off_centre = np.linalg.norm(position - self.grid.center(cell), axis=1) / size
-            self._central[cell] = position[np.argmax(self._easy[row, col] - off_centre)]
+            best = np.argmax(self._easy[row, col] - off_centre)
+            self._central[cell] = position[best].copy()  # not a view of all positions
         return self._central[cell]
 
     # --- posts of T2 ---

@@ -68,7 +68,7 @@ def surface_of(terrain: xr.Dataset, max_slope: float | None = None) -> Surface:
     Pixels are passable if their slope is known and at most `max_slope`, in rad; without a limit,
     all pixels with a height are passable.
     """
-    ground, canopy = (terrain[name].values.astype(float) for name in ("dem", "dsm"))
+    ground, canopy = (np.require(terrain[name].values, float, "W") for name in ("dem", "dsm"))
     pixel = pixel_size(terrain)
     surface = Surface(
         ground=ground,
