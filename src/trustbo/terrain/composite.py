@@ -66,7 +66,7 @@ class CompositeIndex:
         x = np.stack([column.ravel()[known] for column in columns], axis=1)
         del known
         low, high = np.percentile(x, _WINSORISED, axis=0)
-        x = np.clip(x, low, high)
+        np.clip(x, low, high, out=x)
 
         mean = x.mean(0)
         sd = x.std(0)
@@ -74,7 +74,9 @@ class CompositeIndex:
         varies = sd > _CONSTANT * np.maximum(1.0, np.abs(mean))
         sd = np.where(varies, sd, np.inf)
 
-        z = ((x - mean) / sd)[:, varies]
+        x -= mean
+        x /= sd
+        z = x[:, varies]
         signs = np.array([*self.signs.values()])
         loadings = np.zeros(len(signs))
         ratios = np.ones(1)
@@ -137,8 +139,12 @@ class CompositeIndex:
         weights = fitted["loading"].values / sd
         bottom = fitted.bottom
         top = fitted.top
-        columns = enumerate(self._columns(features))
-        score = sum(weights[k] * (np.clip(x, low[k], high[k]) - mean[k]) for k, x in columns)
+        score: np.ndarray | float = 0.0
+        for k, column in enumerate(self._columns(features)):
+            x = np.clip(column, low[k], high[k])
+            x -= mean[k]
+            x *= weights[k]
+            score = score + x
 
         if top - bottom < _CONSTANT:
             return np.where(np.isfinite(score), 0.5, np.nan)

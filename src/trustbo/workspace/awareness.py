@@ -85,7 +85,7 @@ def pixel_maps(
         parts_of = {part: values_of(part) for part in names}
 
         index = CompositeIndex({part: FEATURES[part].sign for part in parts_of}).fit(parts_of)
-        pixels[name] = index.transform(parts_of)
+        pixels[name] = np.ascontiguousarray(index.transform(parts_of))  # as kernels need it
         composites[name] = index
         del parts_of  # rasters, which the next feature would otherwise add to
 

@@ -18,7 +18,6 @@ from itertools import batched
 from typing import NamedTuple, cast
 
 import numpy as np
-from scipy import ndimage
 
 from trustbo.display import bar, compiling
 from trustbo.kernels import kernel, part
@@ -157,7 +156,7 @@ class Difficulty:
                 onward = None if n == END else (c[0] + MOVES[n][0], c[1] + MOVES[n][1])
                 goals[1:, k, n] = posts.watching(c, onward)
 
-        rasters = self._easy, self._room, surface.gradient
+        rasters = self._easy, posts.routes.room, surface.gradient
         place = surface.pixel, surface.origin
         robots = posts.team.lead, *posts.team.robots
         worst = np.zeros((*exists.shape, len(MEASURES)))
@@ -176,15 +175,7 @@ class Difficulty:
         """Traversability of each pixel, NaN where unknown."""
         if self._traversability is not None:
             return plain(self._traversability)
-        return np.full(self._room.shape, np.nan)
-
-    @cached_property
-    def _room(self) -> np.ndarray:
-        """Distance of each pixel to the nearest impassable one, m; inf if there is none."""
-        surface = cast("Posts", self._posts).surface
-        if surface.passable.all():
-            return np.full(surface.ground.shape, np.inf)
-        return np.asarray(ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel))
+        return np.full(cast("Posts", self._posts).routes.room.shape, np.nan)
 
 
 @_compiled
