@@ -5,8 +5,9 @@ an array (row, col), or a DataArray (y, x), NaN where unknown. `feature` registe
 for composites, as in the example in `docs/terrain.md`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import reduce
+from itertools import product, starmap
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -137,8 +138,8 @@ def _origin(function: Callable[..., Any]) -> tuple[object, ...]:
     return tuple(getattr(function, name, None) for name in ("__module__", "__qualname__"))
 
 
-def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
-    """Return the nine heights of each pixel's 3 x 3 window, by step (down, right).
+def _window(z: np.ndarray) -> Callable[[int, int], np.ndarray]:
+    """Return a function that gives the heights one step (down, right) from each pixel.
 
     Heights beyond the raster and missing heights are as in gdaldem with -compute_edges: beyond an
     edge, the ground continues straight on; in the four corners, it does so to the north and south,
@@ -147,16 +148,20 @@ def _window(z: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
     across, along = ((0, 0), (1, 1)), ((1, 1), (0, 0))
     inner = np.pad(_straight_on(z, across), along, mode="edge")
     outer = _straight_on(np.pad(z, across, mode="edge"), along)  # for the first and the last row
-
     rows, cols = z.shape
-    window = {}
-    for down in (-1, 0, 1):
-        for right in (-1, 0, 1):
-            there = slice(1 + down, 1 + down + rows), slice(1 + right, 1 + right + cols)
-            height = inner[there].copy()
-            height[[0, -1]] = outer[there][[0, -1]]
-            window[down, right] = np.where(np.isfinite(height), height, z)
-    return window
+
+    def heights(down: int, right: int) -> np.ndarray:
+        there = slice(1 + down, 1 + down + rows), slice(1 + right, 1 + right + cols)
+        height = inner[there].copy()
+        height[[0, -1]] = outer[there][[0, -1]]
+        return np.where(np.isfinite(height), height, z)
+
+    return heights
+
+
+def _all_heights(z: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the nine heights of each pixel's 3 x 3 window, one array after another."""
+    return starmap(_window(z), product((-1, 0, 1), repeat=2))
 
 
 def _straight_on(z: np.ndarray, width: Any) -> np.ndarray:
@@ -182,8 +187,8 @@ def horn_gradient(dem: np.ndarray, pixel: tuple[float, ...]) -> np.ndarray:
     """Compute the gradient of heights and pixels that have been checked; see `gradient`."""
     height, width = pixel
     w = _window(dem)
-    east = (w[-1, 1] - w[-1, -1]) + 2.0 * (w[0, 1] - w[0, -1]) + (w[1, 1] - w[1, -1])
-    south = (w[1, -1] - w[-1, -1]) + 2.0 * (w[1, 0] - w[-1, 0]) + (w[1, 1] - w[-1, 1])
+    east = (w(-1, 1) - w(-1, -1)) + 2.0 * (w(0, 1) - w(0, -1)) + (w(1, 1) - w(1, -1))
+    south = (w(1, -1) - w(-1, -1)) + 2.0 * (w(1, 0) - w(-1, 0)) + (w(1, 1) - w(-1, 1))
     return np.stack([0.125 * east / width, -0.125 * south / height])
 
 
@@ -198,22 +203,22 @@ def slope(terrain: xr.Dataset) -> np.ndarray:
 @feature("roughness", sign=-1)
 def roughness(terrain: xr.Dataset) -> np.ndarray:
     """Compute the range of ground heights in the 3 x 3 window, m (Wilson et al. 2007)."""
-    window = _window(terrain["dem"].values).values()
-    return reduce(np.maximum, window) - reduce(np.minimum, window)
+    z = terrain["dem"].values
+    return reduce(np.maximum, _all_heights(z)) - reduce(np.minimum, _all_heights(z))
 
 
 @feature("tri", sign=-1)
 def tri(terrain: xr.Dataset) -> np.ndarray:
     """Compute the terrain ruggedness index, m: root sum of squared steps (Riley 1999)."""
     z = terrain["dem"].values
-    return np.sqrt(sum(((w - z) ** 2 for w in _window(z).values()), np.zeros_like(z)))
+    return np.sqrt(sum(((w - z) ** 2 for w in _all_heights(z)), np.zeros_like(z)))
 
 
 @feature("step_height", sign=-1)
 def step_height(terrain: xr.Dataset) -> np.ndarray:
     """Compute the largest step to one of the 8 neighbours, m; missing neighbours are ignored."""
     z = terrain["dem"].values
-    return reduce(np.maximum, (np.abs(w - z) for w in _window(z).values()))
+    return reduce(np.maximum, (np.abs(w - z) for w in _all_heights(z)))
 
 
 @feature("canopy_height", sign=-1)

@@ -19,7 +19,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from trustbo.display import bar, compiling
+from trustbo.display import slow_bar
 from trustbo.kernels import kernel, part
 from trustbo.parallel import in_order, plain
 from trustbo.workspace.moves import END, MOVES, possible_next
@@ -37,7 +37,6 @@ _BESIDE = 1.001  # pixels; a route this close to an impassable pixel is beside i
 _MOST = 2.0  # largest value of the measure tilt
 _TIGHT = 3.0  # log(1 + length in m) at which tightness is 1: 19 m
 _BLOCK = 64  # bounds per task of a thread
-_PATIENCE = 2.0  # seconds of work before a progress bar appears
 _NONE = -1  # unit of a bound that does not exist
 _compiled = kernel()
 _part = part()
@@ -121,8 +120,7 @@ class Difficulty:
     def _measure(self, bounds: np.ndarray) -> None:
         """Measure the given bounds (bound, 3), which exist and have a terrain."""
         blocks = [np.array(block) for block in batched(bounds, _BLOCK)]
-        shown = {"desc": "difficulty of bounds", "unit": "bound", "total": len(bounds)}
-        with compiling(), bar(True, delay=_PATIENCE, leave=False, **shown) as progress:
+        with slow_bar("difficulty of bounds", "bound", True, total=len(bounds)) as progress:
             measured = in_order(self._of_block, blocks)
             for block, values in zip(blocks, measured, strict=True):
                 index = tuple(block.T)
