@@ -74,7 +74,7 @@ peers: $(VENV)/.installed
 
 clean:
 	rm -rf $(VENV) .cache .hypothesis .pytest_cache .ruff_cache .import_linter_cache __pycache__
-	rm -rf build dist out/docs out/nbmake docs/_build docs/generated docs/notebooks notebooks/out
+	rm -rf build dist out/docs out/nbmake docs/_build docs/generated docs/notebooks notebooks/out maps.png
 	find src tests benchmarks docs examples notebooks scripts -type d \
 		\( -name __pycache__ -o -name .ipynb_checkpoints \) -prune -exec rm -rf {} +
 
