@@ -3,10 +3,10 @@
     python benchmarks/inference.py [fits] [nuts] [paper] [memory] [busy] [filter]
 
 `fits`: CPU time of fits of the default model to 3, 15, 60 and 200 missions, and of fits with shared
-noise, with censored rates, with counts of ticks and of `CoupledTrust`. A `later` fit starts from
-the posterior of the fit to one mission fewer, as in a campaign. The first fit of the process, to 3
-missions, has its own row. Missions are on different random paths, or on 10 paths, as in a campaign
-that repeats its paths.
+noise, with censored rates, with counts of ticks and of `CoupledTrust`. --only selects fits by name.
+A `later` fit starts from the posterior of the fit to one mission fewer, as in a campaign. The first
+fit of the process, to 3 missions, has its own row. Missions are on different random paths, or on 10
+paths, as in a campaign that repeats its paths.
 `nuts`: CPU time of `sampler="nuts"` for the default model and eight missions, with compilation, and
 the difference of the means from those of importance sampling.
 `accuracy`: errors of the posterior means of fits with 10 x --seeds seeds, in posterior standard
@@ -19,7 +19,9 @@ before. The effective size is the smaller of the sizes for beta0 and delta_w. Th
 sets. The rates of `missions` have no memory, so they determine delta_w^2 + delta_v^2 but say little
 about delta_w and delta_v separately. The other rates are simulated from the model with beta0 = 0.6.
 All peers together take some 30 minutes of CPU time; set NPROC=1 to run JAX in one thread.
-`memory`: bytes of a posterior of 60 missions, with all groups and with the parameters alone.
+`memory`: bytes of a posterior of 60 missions on random paths, with all groups and with the
+parameters alone, and of the parameters after 60 missions on 10 paths, as a campaign keeps them
+after each mission.
 `busy`: wall time of a fit to 60 missions with all groups, alone and beside two processes that
 always compute. If three processes share two cores fairly, the ratio is 1.5.
 `filter`: time to update the filter with one bound of three robots, with 1000 draws.
@@ -57,11 +59,14 @@ FITS = {
     "default model, 15 missions": (15, DEFAULT, None),
     "default model, 60 missions": (60, DEFAULT, None),
     "default model, 200 missions": (200, DEFAULT, None),
+    "default model, 15 missions on 10 paths": (15, DEFAULT, 10),
     "default model, 60 missions on 10 paths": (60, DEFAULT, 10),
     "default model, 200 missions on 10 paths": (200, DEFAULT, 10),
     "shared noise, 15 missions": (15, SHARED, None),
     "censored rates, 15 missions": (15, CENSORED, None),
     "counts of ticks, 15 missions": (15, COUNTS, None),
+    "censored rates, 60 missions": (60, CENSORED, None),
+    "counts of ticks, 60 missions": (60, COUNTS, None),
     "CoupledTrust with robot effects, 15 missions": (15, COUPLED, None),
 }
 """Number of missions, model, and number of paths (None if all differ), by name."""
@@ -115,7 +120,7 @@ def timed_fits(given):
     columns = "fit", "CPU s, median", "least", "most", "kish", "ms per effective point", "k-hat"
     table = Table(*columns, first=40)
     one_case(table, "default model, 3 missions", 1, label="first fit of the process")
-    for name in FITS:
+    for name in given.only or FITS:
         one_case(table, name, given.seeds)
         if FITS[name][1] is DEFAULT:
             one_case(table, name, given.seeds, later=True)
@@ -304,6 +309,10 @@ def memory(given):
     table.row("all groups", f"{fitted.nbytes / 1e6:.2f}")
     table.row("parameters alone", f"{parameters_alone(fitted).nbytes / 1e6:.2f}")
 
+    options = {"draws": 250, "latent": False, "check": False}
+    repeated = tb.fit(missions(60, n_paths=10), DEFAULT, **options)
+    table.row("parameters, 10 paths", f"{parameters_alone(repeated).nbytes / 1e6:.2f}")
+
 
 def busy(given):
     """Print the wall time of a fit alone and beside two processes that always compute."""
@@ -358,7 +367,9 @@ PARTS = {
 
 
 def main():
-    given = parsed(arguments(__doc__, names=PARTS, seeds=5))
+    parser = arguments(__doc__, names=PARTS, seeds=5)
+    parser.add_argument("--only", action="append", choices=FITS, help="fit to time, by name")
+    given = parsed(parser)
     for part in given.names:
         PARTS[part](given)
 

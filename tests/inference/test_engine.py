@@ -1,7 +1,5 @@
 """The engine against the joint normal of all rates, and a plain NumPyro program."""
 
-import sys
-
 import jax
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from dense_families import with_one_limit
 from every_model import FEATURES, GRID, models_of, observed
 from numpyro import handlers
 
-from trustbo.inference import engine, factor
+from trustbo.inference import engine
 from trustbo.inference.density import Density, at
 from trustbo.models.backend import own_settings
 from trustbo.models.visited import visited
@@ -122,48 +120,6 @@ def test_first_missions_keep_their_maps():
     few = posterior.observations.visited.first(2)
     assert sorted(set(few.bound_map.tolist())) == [0, 1]
     assert few.at.shape[0] == 2
-
-
-@pytest.fixture
-def chained(monkeypatch):
-    """Eliminates robots' effects as chains, as with a hundred missions, in blocks of 2 missions."""
-    monkeypatch.setattr(sys.modules["trustbo.inference.density"], "CHAINED", 2)
-    monkeypatch.setattr(factor, "CHAIN_BLOCK", 6)
-
-
-@pytest.mark.usefixtures("chained")
-@pytest.mark.parametrize("gaps", [False, True])
-@pytest.mark.parametrize("name", [name for name in GAUSSIAN if "robots" in name])
-def test_effects_split_into_chains_have_the_same_evidence(name, gaps):
-    posterior, theta, dense = posterior_of(GAUSSIAN[name], gaps=gaps, shape=(7, 5, 3))
-    assert posterior.blocks.order.hidden.shape == (7, 3)
-    expected = dense(theta).log_density()
-    np.testing.assert_allclose(posterior.log_evidence(theta), expected, rtol=1e-9)
-
-
-@pytest.mark.usefixtures("chained")
-@pytest.mark.parametrize(
-    "name",
-    [
-        f"pooled, {EVERYTHING}",
-        f"pooled, deviation, shared noise, {EVERYTHING}",
-        "hierarchical, robots",
-        f"coupled, {EVERYTHING}",
-    ],
-)
-def test_effects_split_into_chains_have_the_same_draws(name):
-    posterior, theta, dense = posterior_of(GAUSSIAN[name], gaps=True, shape=(7, 5, 3))
-    drawn = posterior.draw_coefficients(at(theta, np.zeros(4000, int)), np.random.default_rng(0))
-    mean, cov = (moment[0] for moment in dense(theta).coefficients())
-    sd = np.sqrt(np.diag(cov))
-    assert (np.abs(drawn.mean(0) - mean) < 5.0 * sd / np.sqrt(4000)).all()
-    np.testing.assert_allclose(drawn.std(0), sd, rtol=5.0 / np.sqrt(8000))
-
-
-@pytest.mark.usefixtures("chained")
-def test_slopes_of_chains_in_jax_are_those_in_numpy():
-    posterior, *_ = posterior_of(GAUSSIAN[f"pooled, {EVERYTHING}"], gaps=True)
-    require_equal_slopes(posterior)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1, 3), (3, 4, 1)])

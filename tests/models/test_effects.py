@@ -148,7 +148,6 @@ def test_the_prior_of_a_robot_s_effects_has_a_lasting_and_an_independent_part(th
     effect = RobotEffect(rho=0.8)
     observations = PooledTrust().observations(missions)
     _, parts = effect.prior(theta, observations)
-    chains = effect.chains(theta, observations)
     inverse_gain = theta["inverse_gain"].reshape(2, -1) * np.ones(N_ROBOTS)
     assert len(parts) == N_ROBOTS
     for point in range(2):
@@ -156,12 +155,6 @@ def test_the_prior_of_a_robot_s_effects_has_a_lasting_and_an_independent_part(th
             expected = covariance_of_missions(point, N_MISSIONS, 0.8)
             expected = inverse_gain[point, i] ** 2 * expected  # of coefficients, which are drift
             np.testing.assert_allclose(np.linalg.inv(precision[point]), expected, rtol=1e-9)
-
-            of_chain = np.eye(N_MISSIONS) / chains.independent[point, i]
-            for m in range(N_MISSIONS):
-                for other in range(N_MISSIONS):
-                    of_chain[m, other] += 0.8 ** abs(m - other) / chains.lasting[point, i]
-            np.testing.assert_allclose(of_chain, expected, rtol=1e-9)
 
 
 def test_a_robot_s_effect_in_the_next_mission_is_normal_given_the_missions_before():

@@ -8,7 +8,6 @@ from scipy import sparse
 
 from trustbo.inference import ep, gradient
 from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, evidence
-from trustbo.inference.factor import Order
 from trustbo.inference.importance import Student, climb
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
@@ -18,10 +17,10 @@ from trustbo.statespace.matrices import namespace
 
 _CHUNK = 32
 """Largest number of points evaluated at once."""
-_NUMBERS = 5_000_000
+_LEAST_CHUNK = 8
+"""Smallest number of points evaluated at once, for which vector instructions still pay."""
+_NUMBERS = 12_000_000
 """Largest number of precision entries of the points evaluated at once."""
-CHAINED = 100
-"""Smallest number of missions at which lasting effects are eliminated as chains."""
 _FEW = 15
 """Number of missions with which the search for the mode begins."""
 _SIZES = (0.3, 1.0, 1.8, 2.6)
@@ -104,11 +103,12 @@ class Density:
         self.ends = np.cumsum([0, *(U.shape[1] for U in designs)])
         self._U = self.layout.design(sparse.hstack(designs, format="csr"))
         self.exact = model.likelihood.gaussian
-        self._chained = self.exact and observations.n_missions >= CHAINED
 
+        # Which columns depend on each other a priori does not depend on theta, so any will do.
         y = self.layout.rows(observations.contact_rate)
+        prior = self.prior(self.theta(np.zeros((1, self.n_scores))))
         self.blocks = Blocks.from_rows(
-            y, self._U, self.layout.label, apart=not self.exact, order=self._order()
+            y, self._U, self.layout.label, prior=prior, apart=not self.exact
         )
         if not self.exact:
             self.rates = ep.Rates(model.likelihood, y, self.layout.rows(observations.n_ticks))
@@ -117,24 +117,7 @@ class Density:
     @property
     def _n_at_once(self) -> int:
         """Number of points evaluated at once, which limits the memory for their matrices."""
-        return int(np.clip(_NUMBERS // self.blocks.order.size, 1, _CHUNK))
-
-    def _order(self) -> Order:
-        """Find the order in which the columns are eliminated; see `Order`."""
-        n_missions = self.observations.n_missions
-        n_rows, n_columns = self._U.shape
-
-        # Which columns are independent a priori does not depend on theta, so any theta will do.
-        prior = self._prior_of_fit(self.theta(np.zeros((1, self.n_scores))))
-        free = np.concatenate([np.full(part.shape[1], part.ndim == 2) for part in prior.parts])
-
-        # The rows of U are sorted by mission, with equally many rows per mission.
-        entries = self._U.tocoo()
-        met = np.zeros((n_missions, n_columns), dtype=bool)
-        met[entries.row * n_missions // n_rows, entries.col] = True
-
-        n_chains = 0 if prior.chains is None else prior.chains.lasting.shape[1]
-        return Order.from_masks(met, free, n_chains)
+        return int(np.clip(_NUMBERS // self.blocks.order.size, _LEAST_CHUNK, _CHUNK))
 
     def without(self, mission: int) -> "Density":
         """Return the density without the data of one mission."""
@@ -306,31 +289,6 @@ class Density:
             [effect.prior(theta, self.observations) for effect in self.model.terms]
         )
 
-    def _prior_of_fit(self, theta: Theta) -> Prior:
-        """Return the prior in the form that is fastest for computing the evidence."""
-        n_missions = self.observations.n_missions
-        groups = []
-        chains = None
-        first = 0
-        for effect, start in zip(self.model.terms, self.ends[:-1], strict=True):
-            found = None
-            if self._chained and chains is None:  # `Order` has one group of hidden columns
-                found = effect.chains(theta, self.observations)
-            if found is None:
-                groups.append(effect.prior(theta, self.observations))
-                continue
-
-            chains = found
-            first = int(start)
-            xp = namespace(chains.independent)
-            of_columns = xp.repeat(chains.independent, n_missions, axis=1)
-            groups.append((None, [of_columns]))
-
-        prior = Prior.from_groups(groups)
-        if chains is None:
-            return prior
-        return prior.with_chains(chains, first, n_missions)
-
     def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence of Gaussian rates at each theta; also return the prior."""
         predictor, prior = self._at(theta)
@@ -341,7 +299,7 @@ class Density:
         """Return the distribution of the linear predictors and the prior at each theta."""
         self.evaluated(len(theta["inverse_gain"]))
         predictor = self.model.linear_predictor(theta, self.observations, self.layout)
-        return predictor, self._prior_of_fit(theta)
+        return predictor, self.prior(theta)
 
     def site_precision(self, predictor: LinearPredictor) -> Any:
         """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured."""

@@ -10,30 +10,26 @@ other families, they are found by expectation propagation (`ep`). With
 L L' = 1 + lam^1/2 (S + noise) lam^1/2 and W = L^-1 lam^1/2, the model is a regression of W (y - m)
 on W T U with unit noise. Products of columns for pairs of inputs, summed over the blocks of one
 kind, do not depend on theta. Therefore, one sparse product suffices to compute U' (W T)' (W T) U
-for all theta and any number of missions.
-
-The same code runs in NumPy, without compilation, and in JAX, with derivatives.
+for all theta and any number of missions. The sums that vanish, such as those of contrasts between
+robots, make the precision sparse; see `sparse`.
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy import sparse
 
-from trustbo.inference.factor import (
-    Factor,
-    Order,
-    add,
-    add_products,
-    cholesky,
-    log_det,
-    log_diagonal,
-    times,
-)
-from trustbo.models.effects.effect import Chains
+from trustbo.inference.factor import cholesky, log_det, log_diagonal, upper
+from trustbo.inference.sparse import Factor, Order
+from trustbo.kernels import kernel
+from trustbo.parallel import plain
 from trustbo.statespace.blocks import LinearPredictor, each
 from trustbo.statespace.matrices import namespace
+
+_NEGLIGIBLE = 1e-12
+"""Size of a sum of products, relative to the largest one, below which it counts as 0."""
 
 
 class Blocks(NamedTuple):
@@ -46,11 +42,12 @@ class Blocks(NamedTuple):
     seen: np.ndarray  # (kind, row)
     sums: Any  # sparse (entry, kind * pair of inputs), for the precision entries in `at`
     at: np.ndarray  # (entry,), precision entries with products of columns; see `Order`
+    of_prior: Sequence[np.ndarray]  # precision entries of each part of the prior; see `Prior`
     order: Order
 
     @classmethod
     def from_rows(
-        cls, y: np.ndarray, U: Any, label: np.ndarray, *, order: Order, apart: bool = False
+        cls, y: np.ndarray, U: Any, label: np.ndarray, *, prior: "Prior", apart: bool = False
     ) -> Self:
         """Group blocks into kinds; a kind has blocks with equal labels and equal missing rows.
 
@@ -58,7 +55,7 @@ class Blocks(NamedTuple):
             y: Observations (block, row), NaN where not measured.
             U: Design as a sparse matrix (block * input, column).
             label: Index (block,) of each block on the second axis of a `LinearPredictor`.
-            order: Order in which the columns are eliminated.
+            prior: Prior at any theta, which shows which columns depend on each other.
             apart: Whether each block is a separate kind, which is needed if sites differ between
                 blocks.
         """
@@ -75,14 +72,12 @@ class Blocks(NamedTuple):
         kind = kind.ravel()
 
         # Pairs of inputs are unordered: one number stands for both (k, j) and (j, k).
-        upper = np.triu_indices(n_inputs)
-        n_pairs = len(upper[0])
+        above = upper(n_inputs)
+        n_pairs = len(above[0])
         pair = np.zeros((n_inputs, n_inputs), dtype=int)
-        pair[upper] = pair.T[upper] = np.arange(n_pairs)
+        pair[above] = pair.T[above] = np.arange(n_pairs)
 
-        entries = []
-        where = []
-        values = []
+        parts = []
         for g in range(len(kinds)):
             rows = (np.flatnonzero(kind == g)[:, None] * n_inputs + np.arange(n_inputs)).ravel()
             X = sparse.csr_array(U[rows].reshape(len(rows) // n_inputs, n_inputs * n_columns))
@@ -90,16 +85,22 @@ class Blocks(NamedTuple):
 
             k, a = np.divmod(products.row, n_columns)  # input and column
             j, b = np.divmod(products.col, n_columns)
-            entry = order.entry(a, b)
-            is_stored = entry >= 0
-            entries.append(entry[is_stored])
-            where.append((g * n_pairs + pair[k, j])[is_stored])
-            values.append(products.data[is_stored])
+            parts.append((a, b, g * n_pairs + pair[k, j], products.data))
+        a, b, where, values = (np.concatenate(part) for part in zip(*parts, strict=True))
 
-        at, row = np.unique(np.concatenate(entries), return_inverse=True)
-        index = row, np.concatenate(where)
+        largest = np.abs(values).max(initial=0.0)
+        kept = np.abs(values) > _NEGLIGIBLE * largest
+        a, b, where, values = a[kept], b[kept], where[kept], values[kept]
+
+        coupled = prior.coupled()
+        coupled[a, b] = True
+        order = Order.from_pattern(coupled)
+
+        entry = order.entry(a, b)
+        kept = entry >= 0
+        at, row = np.unique(entry[kept], return_inverse=True)
         shape = len(at), len(kinds) * n_pairs
-        sums = sparse.csr_array((np.concatenate(values), index), shape=shape)
+        sums = sparse.csr_array((values[kept], (row, where[kept])), shape=shape)
         return cls(
             y=np.where(seen, y, 0.0),
             U=U,
@@ -108,8 +109,67 @@ class Blocks(NamedTuple):
             seen=kinds[:, 2:].astype(bool),
             sums=sums,
             at=at,
+            of_prior=prior.entries(order),
             order=order,
         )
+
+    def precision(self, pairs: np.ndarray, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """Compute the posterior precision (entry, point) of the coefficients.
+
+        Args:
+            pairs: Products of all pairs of columns of C = W T (point, kind * pair of inputs).
+            parts: Parts of the prior precision; see `Prior`.
+        """
+        A = np.zeros((self.order.size, len(pairs)))
+        sums = self.sums
+        _add_products(A, self.at, sums.indptr, sums.indices, sums.data, plain(pairs.T))
+
+        for part, entries in zip(parts, self.of_prior, strict=True):
+            if part.ndim == 3:
+                part = part[:, *upper(part.shape[1])]
+            _add(A, entries, plain(part.T))
+        return A
+
+
+@kernel(fastmath={"contract"})
+def _add_products(
+    A: np.ndarray,
+    at: np.ndarray,
+    ends: np.ndarray,
+    column: np.ndarray,
+    value: np.ndarray,
+    x: np.ndarray,
+) -> None:
+    """Add a sparse matrix, given by its arrays, times x (column, point) to entries of A."""
+    n_points = A.shape[1]
+    for row in range(len(at)):
+        entry = at[row]
+        i = ends[row]
+        while i + 4 <= ends[row + 1]:  # four at once, to store each sum less often
+            a = column[i]
+            b = column[i + 1]
+            c = column[i + 2]
+            d = column[i + 3]
+            for p in range(n_points):
+                A[entry, p] += (
+                    value[i] * x[a, p]
+                    + value[i + 1] * x[b, p]
+                    + value[i + 2] * x[c, p]
+                    + value[i + 3] * x[d, p]
+                )
+            i += 4
+        while i < ends[row + 1]:
+            for p in range(n_points):
+                A[entry, p] += value[i] * x[column[i], p]
+            i += 1
+
+
+@kernel()
+def _add(A: np.ndarray, at: np.ndarray, values: np.ndarray) -> None:
+    """Add values (row, point) to entries of A."""
+    for row in range(len(at)):
+        for p in range(A.shape[1]):
+            A[at[row], p] += values[row, p]
 
 
 class Prior(NamedTuple):
@@ -118,8 +178,6 @@ class Prior(NamedTuple):
     mean: Any  # (point, column)
     parts: Sequence[Any]  # precisions (point, k, k), or (point, k) of independent columns, in order
     log_det: Any  # (point,), of the full precision
-    chains: Chains | None = None  # lasting parts of columns, as hidden columns
-    first: int = 0  # first column with a lasting part
 
     @classmethod
     def from_groups(cls, groups: Sequence[tuple[Any, Sequence[Any]]]) -> Self:
@@ -149,65 +207,33 @@ class Prior(NamedTuple):
         xp = namespace(parts[0])
         return cls(xp.concatenate(means, axis=1), parts, log_det_of_all)
 
-    def add_to(self, A: Any, order: Order) -> Any:
-        """Add the prior precision to A (point, entry), the stored entries of precision matrices."""
-        start = 0
-        for part in self.parts:
-            end = start + part.shape[1]
-            i = np.arange(start, end)
-            start = end
+    @property
+    def _columns(self) -> list[np.ndarray]:
+        """Columns of each part."""
+        ends = np.cumsum([0, *(part.shape[1] for part in self.parts)])
+        return [np.arange(*span) for span in pairwise(ends)]
+
+    def coupled(self) -> np.ndarray:
+        """Return which pairs of columns (column, column) depend on each other a priori."""
+        n_columns = self.mean.shape[1]
+        coupled = np.eye(n_columns, dtype=bool)
+        for part, i in zip(self.parts, self._columns, strict=True):
+            if part.ndim == 3:
+                coupled[i[:, None], i] = True
+        return coupled
+
+    def entries(self, order: Order) -> list[np.ndarray]:
+        """Return the entries of a precision to which each part, or its upper triangle, is added."""
+        entries = []
+        for part, i in zip(self.parts, self._columns, strict=True):
             if part.ndim == 2:
-                A = add(A, (slice(None), order.entry(i, i)), part)
-            elif isinstance(A, np.ndarray):  # dependent columns are neighbours in the core
-                _, _, C = order.views(A)
-                first = order.place[i[0]]
-                last = order.place[i[-1]] + 1
-                C[:, first:last, first:last] += part
-            else:
-                a, b = np.triu_indices(len(i))
-                A = add(A, (slice(None), order.entry(i[a], i[b])), part[:, a, b])
+                entries.append(order.entry(i, i))
+                continue
 
-        if self.chains is None:
-            return A
-        return self._add_chains(A, order)
-
-    def with_chains(self, chains: Chains, first: int, n_missions: int) -> Self:
-        """Add hidden columns, which are the lasting parts of the columns from `first` onwards.
-
-        The other columns then have the precision of their independent parts, which is stored in
-        `parts`.
-        """
-        xp = namespace(chains.lasting)
-        n_chains = chains.lasting.shape[1]
-
-        # In a stationary AR(1) chain, the first state has the full variance, and the innovations of
-        # the others have 1 - rho^2 of it.
-        of_hidden = n_missions * xp.log(chains.lasting).sum(1)
-        of_hidden = of_hidden - n_chains * (n_missions - 1) * np.log(1.0 - chains.rho**2)
-        return self._replace(log_det=self.log_det + of_hidden, chains=chains, first=first)
-
-    def _add_chains(self, A: Any, order: Order) -> Any:
-        """Add the precision of the hidden columns s and their coupling to the columns s + e."""
-        independent, lasting, rho = self.chains  # pyright: ignore[reportGeneralTypeIssues]
-        n_missions = len(order.hidden)
-        s = order.hidden.T  # (chain, mission)
-        total = self.first + np.arange(s.size).reshape(s.shape)
-
-        # The precision of an AR(1) chain is tridiagonal (Rue and Held 2005, chapter 1).
-        inner = np.ones(n_missions)
-        inner[1:-1] += rho**2
-        tied = lasting[..., None] / (1.0 - rho**2)  # (point, chain, 1)
-
-        coupling = order.entry(total, s)
-        coupling = np.where(coupling < 0, order.entry(s, total), coupling)
-
-        for entry, values in (
-            (order.entry(s, s), independent[..., None] + tied * inner),
-            (order.entry(s[:, :-1], s[:, 1:]), -rho * tied * np.ones(n_missions - 1)),
-            (coupling, -independent[..., None] * np.ones(n_missions)),
-        ):
-            A = add(A, (slice(None), entry.ravel()), values.reshape(len(A), -1))
-        return A
+            a, b = upper(len(i))
+            entry = order.entry(i[a], i[b])
+            entries.append(np.where(entry < 0, order.entry(i[b], i[a]), entry))
+        return entries
 
     def log_density(self, c: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of coefficients (point, column)."""
@@ -240,7 +266,7 @@ class Fit(NamedTuple):
     """Evidence and factors at each theta; coefficients are mean + F'^-1 (half + white noise)."""
 
     log_p: Any  # (point,)
-    F: Any  # Factor of the posterior precision of the coefficients
+    F: Factor  # of the posterior precision of the coefficients
     half: Any  # (point, column), a whitened vector
     W: Any  # (point, kind, row, row)
 
@@ -258,7 +284,6 @@ def evidence(
         y: Site means (point, block, row), if different from the observations.
     """
     W, log_sites = whiten(blocks, predictor, lam)
-    xp = namespace(W)
     n = len(W)
     b = blocks
 
@@ -267,15 +292,13 @@ def evidence(
     w = (W[:, b.kind] @ residual[..., None])[..., 0]
     C = W @ each(predictor.response, b.label)
 
-    # h = U' C' w; hidden columns do not occur in the data.
-    back = (xp.swapaxes(C, 2, 3)[:, b.kind] @ w[..., None])[..., 0]
-    h = times(b.U.T, back.reshape(n, -1))
-    h = xp.concatenate([h, xp.zeros((n, b.order.hidden.size))], axis=1)
+    # h = U' C' w
+    back = (np.swapaxes(C, 2, 3)[:, b.kind] @ w[..., None])[..., 0]
+    h = (b.U.T @ back.reshape(n, -1).T).T
 
     # A = U' C' C U + prior precision, from products of columns that do not depend on theta.
-    pairs = (xp.swapaxes(C, 2, 3) @ C)[:, :, *np.triu_indices(C.shape[3])]
-    A = add_products(xp.zeros((n, b.order.size)), b.at, b.sums, pairs.reshape(n, -1))
-    A = prior.add_to(A, b.order)
+    pairs = (np.swapaxes(C, 2, 3) @ C)[:, :, *upper(C.shape[3])]
+    A = b.precision(pairs.reshape(n, -1), prior.parts)
 
     n_of_kind = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
     log_p = log_sites @ n_of_kind + 0.5 * (prior.log_det - (w**2).sum((1, 2)))
@@ -298,12 +321,18 @@ def whiten(blocks: Blocks, predictor: LinearPredictor, lam: Any) -> tuple[Any, A
     return xp.linalg.inv(L) * d[..., None, :], log_sites - log_diagonal(L)
 
 
+def inputs(blocks: Blocks, c: np.ndarray) -> np.ndarray:
+    """Compute the inputs U c (point, block, input) of all blocks from coefficients (point, c)."""
+    drift = np.ascontiguousarray((blocks.U @ c.T).T)
+    return drift.reshape(len(c), len(blocks.y), -1)
+
+
 def expected(blocks: Blocks, predictor: LinearPredictor, c: Any) -> Any:
     """Compute the mean linear predictors (point, block, row) given coefficients (point, column)."""
-    drift = times(blocks.U, c).reshape(len(c), len(blocks.y), -1)
+    drift = inputs(blocks, c)
     label = blocks.label[blocks.kind]
     if predictor.response.shape[1] == 1:  # one product for all blocks is faster
-        response = namespace(drift).swapaxes(predictor.response[:, 0], 1, 2)
+        response = np.swapaxes(predictor.response[:, 0], 1, 2)
         return each(predictor.mean, label) + drift @ response
     return each(predictor.mean, label) + (predictor.response[:, label] @ drift[..., None])[..., 0]
 
@@ -317,8 +346,26 @@ def coefficients_of(
     """
     white = rng.standard_normal((len(fit.half), n, fit.half.shape[1]))
     found = fit.F.back(np.concatenate([fit.half[:, None], white], axis=1))
-    found = found[..., : prior.mean.shape[1]]  # without hidden columns
     return prior.mean + found[:, 0], found[:, 1:]
+
+
+def covariance_of_inputs(blocks: Blocks, covariance: np.ndarray, n_inputs: int) -> np.ndarray:
+    """Sum U cov(c) U' (point, kind, input, input) over the blocks of each kind.
+
+    Args:
+        blocks: Data of all blocks.
+        covariance: Posterior covariance of the coefficients, as in `Factor.covariance`.
+        n_inputs: Number of inputs of a block.
+    """
+    pairs = blocks.sums.T @ covariance[blocks.at]
+    n_points = pairs.shape[1]
+    n_kinds = len(blocks.seen)
+
+    # The covariance has half of its diagonal, because M + M' adds it twice.
+    k, j = upper(n_inputs)
+    M = np.zeros((n_points, n_kinds, n_inputs, n_inputs))
+    M[..., k, j] = pairs.T.reshape(n_points, n_kinds, -1)
+    return M + np.swapaxes(M, 2, 3)
 
 
 def marginals(
@@ -341,12 +388,7 @@ def marginals(
     at = expected(blocks, predictor, c)
     mean = at + np.einsum("nbij,nbj->nbi", gain, y - at)
 
-    # M = U cov(c) U' of each block; `covariance` halves the diagonal, because M + M' adds it twice.
-    k, j = np.triu_indices(n_inputs)
-    M = np.zeros((n_points, n_blocks, n_inputs, n_inputs))
-    pairs = times(blocks.sums.T, fit.F.covariance()[:, blocks.at])
-    M[..., k, j] = pairs.reshape(n_points, n_blocks, -1)
-    M = M + np.swapaxes(M, 2, 3)
+    M = covariance_of_inputs(blocks, fit.F.covariance(), n_inputs)
 
     # Law of total variance: the variance given c, plus the variance of the mean given c, which is
     # linear in c.

@@ -15,7 +15,8 @@ import numpy as np
 from scipy import special
 
 from trustbo.inference.engine import Blocks, Prior, evidence, expected, marginals, whiten
-from trustbo.inference.factor import Factor, cholesky
+from trustbo.inference.factor import cholesky
+from trustbo.inference.sparse import Factor
 from trustbo.models.families import Family
 from trustbo.models.families.moments import log_normal
 from trustbo.statespace.blocks import LinearPredictor, each

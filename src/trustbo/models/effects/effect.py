@@ -6,7 +6,7 @@ planning need no change.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,17 +34,6 @@ LEAST = 1e-4
 
 EFFECTS: dict[str, type["Effect"]] = {}
 """Effect classes by name, to read models from files."""
-
-
-class Chains(NamedTuple):
-    """Prior on coefficients c[chain, mission], each the sum of a lasting and an independent part.
-
-    The lasting part is a stationary first-order autoregression over missions.
-    """
-
-    independent: Any  # (point, chain), precision of the independent part
-    lasting: Any  # (point, chain), precision of the lasting part in one mission
-    rho: float  # correlation of the lasting part between consecutive missions
 
 
 class Effect:
@@ -98,14 +87,6 @@ class Effect:
             groups of columns. Each has shape (point, k, k), or (point, k) for independent columns.
         """
         raise NotImplementedError
-
-    def chains(self, theta: Theta, observations: Observations) -> Chains | None:
-        """Return the same prior in the form of `Chains`, if it has this form.
-
-        This form is faster if there are many missions. In the order of the columns, the mission
-        varies fastest.
-        """
-        return None
 
     def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Convert coefficients c (draw, column) to variables by name."""

@@ -16,7 +16,7 @@ from numpy.random import Generator
 from scipy import sparse
 
 from trustbo.errors import Renamed, require_share
-from trustbo.models.effects.effect import LEAST, Chains, Effect, Theta, Values
+from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.statespace.matrices import namespace
 
@@ -74,12 +74,6 @@ class RobotEffect(Effect):
         if inverse_gain.ndim == 1:
             return None, [Q / inverse_gain[:, None, None] ** 2] * observations.n_robots
         return None, [Q / of_robot[:, None, None] ** 2 for of_robot in inverse_gain.T]
-
-    def chains(self, theta: Theta, observations: Observations) -> Chains:
-        """See `Effect.chains`; each robot is a chain."""
-        slow, mission = self._variances(theta)
-        inverse_gain = theta["inverse_gain"].reshape(len(slow), -1) * np.ones(observations.n_robots)
-        return Chains(1.0 / (mission * inverse_gain**2), 1.0 / (slow * inverse_gain**2), self.rho)
 
     def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return `robot_effect` (draw, mission, robot), the effects d on stationary trust."""
