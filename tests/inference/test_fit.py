@@ -130,7 +130,7 @@ def test_forecasts_have_the_effects_of_robots_in_bounds_and_plans_those_of_the_t
     places = posterior["places"].to_dataset().stack(one=("chain", "draw"))
     bounds = [places[f"bound_{name}"].values for name in ("move", "row", "col")]
     driven = places["place_robot"].transpose("one", "robot", "bound").values
-    np.testing.assert_allclose(of_robots[:, :, *bounds], driven, atol=1e-12)
+    np.testing.assert_allclose(of_robots[:, :, *bounds], driven, atol=1e-7)  # stored as float32
 
     # Elsewhere, effects of robots have the standard deviation tau_r, and are independent.
     undriven = np.ones(of_robots.shape[2:], bool)

@@ -43,6 +43,7 @@ from trustbo.inference.tree import N_PRIOR, in_label_order, to_datatree, with_la
 from trustbo.inference.variables import draws_of, prior_parameters, to_variables
 from trustbo.models.backend import library_attrs
 from trustbo.models.default import default_model
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_to_record
@@ -59,6 +60,10 @@ from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
 """Names of the samplers of `fit`."""
+_N_DRAWS = 1000
+"""Number of posterior draws per chain."""
+_N_PLACE_DRAWS = 250
+"""Number of draws per chain from the importance sampler with place effects."""
 _CORRECTED = 2
 """Number of draws for which the EP density is corrected, per point of a round."""
 _SIZE = 256
@@ -80,7 +85,7 @@ def fit(
     earlier: Iterable[Mission] = (),
     sampler: str | None = None,
     workspace: Workspace | None = None,
-    draws: int = 1000,
+    draws: int | None = None,
     chains: int = 4,
     warmup: int | None = None,
     seed: int = 0,
@@ -112,7 +117,8 @@ def fit(
             `Workspace.fill`), and place effects cover the whole grid. Missions over cells without
             awareness are then left out, with a warning. Without a workspace, the grid of place
             effects ends at the last row and column visited.
-        draws: Number of draws per chain.
+        draws: Number of draws per chain. The default is 1000, or 250 for importance sampling with
+            place effects, whose draws are large.
         chains: Number of NUTS chains. Importance sampling returns the same total number of draws in
             one chain, because its draws are independent of each other.
         warmup: Number of warm-up draws per NUTS chain, which are discarded. The default is 150 for
@@ -161,6 +167,8 @@ def fit(
         scale = missions[0].scale  # empty unless the missions are people's reports
         model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))
     draws, chains, warmup = require_numbers_of_draws(draws, chains, warmup)
+    if draws is None:
+        draws = _default_draws(model, sampler)
     seed = require_whole("seed", seed, 0)
     if all(np.isnan(mission.contact_rate).all() for mission in missions):
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
@@ -205,13 +213,25 @@ def fit(
     return tree
 
 
+def _default_draws(model: TrustModel | Callable[..., Any], sampler: str | None) -> int:
+    """Return the default number of draws per chain; see `fit`."""
+    if sampler == "nuts" or not isinstance(model, TrustModel):
+        return _N_DRAWS
+
+    # Importance draws are independent, so fewer are needed than from a Markov chain.
+    has_places = any(isinstance(effect, PlaceEffect) for effect in model.effects)
+    return _N_PLACE_DRAWS if has_places else _N_DRAWS
+
+
 def require_numbers_of_draws(
-    draws: int, chains: int, warmup: int | None
-) -> tuple[int, int, int | None]:
+    draws: int | None, chains: int, warmup: int | None
+) -> tuple[int | None, int, int | None]:
     """Return these arguments of `fit` as ints; raises TrustboError unless each is at least 1."""
+    if draws is not None:
+        draws = require_count("draws", draws)
     if warmup is not None:
         warmup = require_count("warmup", warmup)
-    return require_count("draws", draws), require_count("chains", chains), warmup
+    return draws, require_count("chains", chains), warmup
 
 
 def require_poolable_with_model(

@@ -42,7 +42,6 @@ from trustbo.inference.functions.function import (
 from trustbo.inference.tree import parameters_alone, with_latent
 from trustbo.models.default import default_model
 from trustbo.models.draws import Draws
-from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_from_record, model_to_record
@@ -52,10 +51,6 @@ from trustbo.workspace import Workspace
 Model = TrustModel | Callable[..., Any]
 """A trust model: an object of a model class, or a NumPyro function."""
 
-_N_DRAWS = 1000
-"""Number of posterior draws of the parameters per chain."""
-_N_PLACE_DRAWS = 250
-"""Number of draws from the importance sampler with place effects, whose draws are large."""
 _N_MEAN = 500
 """Number of prior draws of a function that are averaged for the first plan."""
 
@@ -171,10 +166,6 @@ class ClassLearner:
         **options: Any,
     ) -> xr.DataTree:
         """See `Learner.fit`."""
-        # Importance draws are independent, so fewer are needed than from a Markov chain.
-        has_places = any(isinstance(effect, PlaceEffect) for effect in self._known.effects)
-        few = sampler == "importance" and has_places
-        options = {"draws": _N_PLACE_DRAWS if few else _N_DRAWS} | options
         tree = fit(
             missions,
             self._known,

@@ -120,9 +120,10 @@ def robots_in_bounds_of(
     if set(robots) <= set(group["robot"].values.tolist()):
         n_bounds = group.sizes["bound"]
         column[*_bounds(group)] = np.arange(n_bounds)
-        known = group["place_robot"].sel(robot=list(robots))
-        known = known.transpose("chain", "draw", "robot", "bound").values
-        known = known.reshape(len(tau_r), len(robots), n_bounds)
+        known = group["place_robot"].astype(float)
+        known = known - known.mean("robot")  # 0 but for the rounding to single precision
+        known = known.sel(robot=list(robots)).transpose("chain", "draw", "robot", "bound")
+        known = known.values.reshape(len(tau_r), len(robots), n_bounds)
 
     seed = int(group.attrs["seed"])
     return RobotsInBounds(known, column, tau_r, np.arange(len(tau_r)), seed)
@@ -157,7 +158,8 @@ def _by_draw(group: xr.Dataset, name: str, axis: str) -> np.ndarray:
     """Return the effects (draw, place) of a variable with chains joined."""
     ordered = group[name].transpose("chain", "draw", ...)
     n_draws = ordered.sizes["chain"] * ordered.sizes["draw"]
-    return ordered.values.reshape(n_draws, group.sizes[axis])  # also for 0 places
+    values = ordered.values.astype(float)  # stored in single precision
+    return values.reshape(n_draws, group.sizes[axis])  # also for 0 places
 
 
 def _cells(

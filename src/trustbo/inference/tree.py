@@ -31,7 +31,7 @@ _DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_R
 _N_TRAJECTORIES = 200
 """Number of kept draws of latent trust and predicted rates, evenly spaced in the chains."""
 N_PRIOR = 500
-"""Number of draws in the groups `prior` and `prior_predictive`."""
+"""Number of draws in the group `prior`, of which `prior_predictive` has those that are kept."""
 _ORDER = ("robot", "robot_", "feature", "feature_")
 """Order of the axes of the parameters of model classes.
 
@@ -202,12 +202,18 @@ def with_latent(
         fitted.evaluated = bar.update
         latent = latent_of(fitted, draws, some, stream(seed, "latent"))
 
+    # As for the posterior, predictions of the prior are kept for evenly spaced draws.
     rng = stream(seed, "prior predictive")
     if "prior" in posterior.children:
         prior = parameters_of(posterior, group="prior")
     else:  # the user has dropped it
         prior = prior_parameters(fitted, N_PRIOR, rng)
+    prior = {n: values[_evenly(len(values), _N_TRAJECTORIES)] for n, values in prior.items()}
     replicated = replicate(fitted, with_prior_effects(fitted, prior, rng), rng)
+
+    # Single precision halves the memory; the error is far below the Monte Carlo error.
+    latent = latent._replace(trust=latent.trust.astype(np.float32))
+    replicated = replicated.astype(np.float32)
 
     # Log likelihoods of tick counts are comparable between families. They are NaN where ticks are
     # unknown.
@@ -238,7 +244,7 @@ def add_groups(
         posterior: DataTree with the parameters.
         missions: Fitted missions.
         latent: Trust, likelihoods and predictions, with chains joined.
-        replicated: Rates (draw, mission, bound, robot), one draw for each draw of the group
+        replicated: Rates (draw, mission, bound, robot) for evenly spaced draws of the group
             `prior`.
         densities: Log prior densities (draw,) by name, with chains joined.
         of_counts: Whether the log-likelihoods are of tick counts.
@@ -268,9 +274,10 @@ def add_groups(
     # The draws have the labels of the posterior, which may be part of a longer one.
     kept, _ = kept_draws(posterior)
     some = labels | {"draw": labels["draw"][kept]}
-    prior = {}
+    prior: dict[str, Any] = {}
     if "prior" in posterior.children:
         prior = {name: posterior["prior"][name].values for name in ("chain", "draw")}
+        prior["draw"] = prior["draw"][_evenly(len(prior["draw"]), len(replicated))]
     for name, of_draws in (
         ("log_likelihood", labels),
         ("log_prior", labels),
@@ -290,9 +297,13 @@ def kept_draws(posterior: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:
     sizes = posterior["posterior"].sizes
     n_chains = sizes["chain"]
     n_draws = sizes["draw"]
-    n_kept = min(n_draws, max(1, _N_TRAJECTORIES // n_chains))
-    kept = np.linspace(0, n_draws - 1, n_kept).astype(int)
+    kept = _evenly(n_draws, max(1, _N_TRAJECTORIES // n_chains))
     return kept, (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
+
+
+def _evenly(n: int, n_kept: int) -> np.ndarray:
+    """Return the indices of evenly spaced draws; of all draws, if `n_kept` is `n` or more."""
+    return np.linspace(0, n - 1, min(n, n_kept)).astype(int)
 
 
 def log_prior(fitted: Density, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -10,12 +10,18 @@ from trustbo.models.effects.effect import Theta
 
 
 def to_variables(density: Density, draws: JointDraws) -> dict[str, dict[str, np.ndarray]]:
-    """Return the variables of draws by group (`posterior` and one per effect) and name."""
+    """Return the variables of draws by group (`posterior` and one per effect) and name.
+
+    Effects are stored in single precision, because they take most of the memory of a posterior and
+    the error is far below their Monte Carlo error. Computations read them in double precision.
+    """
     theta = draws.theta
     groups = {"posterior": _hyperparameters(density, theta)}
     ends = zip(density.ends[:-1], density.ends[1:], strict=True)
     for effect, (start, end) in zip(density.model.terms, ends, strict=True):
         of_effect = effect.to_variables(draws.c[:, start:end], theta, density.observations)
+        if effect.group:
+            of_effect = {name: v.astype(np.float32) for name, v in of_effect.items()}
         groups.setdefault(effect.group or "posterior", {}).update(of_effect)
     return groups
 
@@ -23,10 +29,11 @@ def to_variables(density: Density, draws: JointDraws) -> dict[str, dict[str, np.
 def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -> JointDraws:
     """Make draws from variables by group and name, as returned by `to_variables`."""
     theta = _theta_of(density, groups["posterior"])
-    c = [
-        effect.coefficients(groups[effect.group or "posterior"], theta, density.observations)
-        for effect in density.model.terms
-    ]
+    c = []
+    for effect in density.model.terms:
+        stored = groups[effect.group or "posterior"]
+        values = {name: np.asarray(v, dtype=float) for name, v in stored.items()}
+        c.append(effect.coefficients(values, theta, density.observations))
     return JointDraws(theta, np.column_stack(c))
 
 
