@@ -119,6 +119,14 @@ def test_effects_are_in_the_plans_of_the_next_mission():
     assert params.places
 
 
+def test_effects_of_places_are_stored_in_a_thousand_draws_of_single_precision():
+    missions = walking_missions(0, 3)
+    posterior = fit(missions, PooledTrust(effects=PlaceEffect()), latent=False, progress=False)
+    places = posterior["places"].to_dataset()
+    assert places.sizes["chain"] * places.sizes["draw"] == 1000
+    assert {values.dtype for values in places.data_vars.values()} == {np.dtype(np.float32)}
+
+
 def test_forecasts_have_the_effects_of_robots_in_bounds_and_plans_those_of_the_team():
     missions = walking_missions(0, 3)
     posterior = fit(missions, PooledTrust(effects=PlaceEffect()), latent=False, **QUIET)
