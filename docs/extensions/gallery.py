@@ -113,10 +113,10 @@ def figures() -> Iterator[Figure]:
     )  # fmt: skip
     yield Figure(
         "arviz.plot_ppc_dist", predictions,
-        "Posterior predictive check: measured contact rates (black) and predicted ones. The default "
-        "Gaussian family fails this check: rates of exactly 1 are more frequent than it predicts, "
-        "and predictions exceed 1. Plans need the mean of trust only. To predict single rates, use "
-        'the family "censored".',
+        "Posterior predictive check: measured contact rates (black) and predicted ones. The "
+        "default Gaussian family fails this check: rates of exactly 1 are more frequent than it "
+        "predicts, and predictions exceed 1. Plans need the mean of trust only. To predict single "
+        'rates, use the family "censored".',
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.explore",

@@ -279,9 +279,11 @@ def in_order_of(
             {"robot": robots, "feature": features},
         )
     else:
+        known = names_in(posterior, "robot")  # without those that were left out before
         others = np.atleast_1d(posterior.attrs.get("other_robots", [])).tolist()
-        if others and not set(others) <= set(robots):
-            posterior = _without_robots(posterior, [name for name in others if name not in robots])
+        left_out = [name for name in others if name in known and name not in robots]
+        if left_out:
+            posterior = _without_robots(posterior, left_out)
         if "robot" not in posterior["posterior"].dims and "robots" not in posterior.children:
             robots = names_in(posterior, "robot")  # shared by all robots
 

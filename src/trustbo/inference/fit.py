@@ -156,13 +156,7 @@ def fit(
     started = time.perf_counter()
     earlier = list_of_missions(earlier, "earlier")
     missions, robots = _joined(list_of_missions(missions), earlier, workspace)
-    if start is not None:
-        start = as_fitted("start", start)
-        same_robots = names_in(start, "robot") in ((), missions[0].robots)
-        same_features = names_in(start, "feature") in ((), missions[0].features)
-        if not (same_robots and same_features):
-            start = None  # its scores belong to other robots or features
-
+    start = _same_names(start, missions[0])
     if model is None:
         scale = missions[0].scale  # empty unless the missions are people's reports
         model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))
@@ -211,6 +205,17 @@ def fit(
         _label_earlier(tree, len(earlier), missions[0].robots[len(robots) :])
     tree.attrs["seconds"] = time.perf_counter() - started
     return tree
+
+
+def _same_names(start: xr.DataTree | None, mission: Mission) -> xr.DataTree | None:
+    """Return `start` in the order of its fit, or None if its scores belong to other names."""
+    if start is None:
+        return None
+
+    start = as_fitted("start", start)
+    same_robots = names_in(start, "robot") in ((), mission.robots)
+    same_features = names_in(start, "feature") in ((), mission.features)
+    return start if same_robots and same_features else None
 
 
 def _default_draws(model: TrustModel | Callable[..., Any], sampler: str | None) -> int:
