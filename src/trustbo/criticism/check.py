@@ -187,7 +187,7 @@ def _in_all_bounds(posterior: xr.DataTree, robots: np.ndarray) -> np.ndarray:
     places = of_workspace(posterior["places"].to_dataset())
     if "place_robot" not in places or not places.sizes["bound"]:
         return np.zeros(1)
-    in_bounds = joined_draws(places["place_robot"].sel(robot=robots).mean("bound"))
+    in_bounds = joined_draws(places["place_robot"].sel(robot=robots).mean("bound", dtype=float))
     return in_bounds[:, None]
 
 

@@ -125,9 +125,12 @@ def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarra
     """Return draws (draw, ...) with chains joined and with the other axes in the order `axes`.
 
     New draws and draws that are read from a file get the same memory layout. Sums then have the
-    same rounding errors, which makes a resumed campaign bit-identical.
+    same rounding errors, which makes a resumed campaign bit-identical. Effects are stored in single
+    precision, but computations are in double precision.
     """
     values = np.ascontiguousarray(array.transpose("chain", "draw", *axes).values)
+    if values.dtype == np.float32:
+        values = values.astype(np.float64)
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also for 0 draws
 
 
