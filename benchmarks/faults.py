@@ -71,7 +71,7 @@ FAULTS = (
     Fault("weights that leave out a mission have the wrong sign", "inference/loo.py",
           "smoothed(target.log_share - log_p,", "smoothed(target.log_share + log_p,"),
     Fault("a bound that failed is also counted as passed", "hazard/risk.py",
-          "b += self._trials[units] - failed", "b += self._trials[units]"),
+          "b += trials - failed", "b += trials"),
     Fault("the margin raises the slope limit", "hazard/prior.py",
           "expit((steepness + limit[:, :1])", "expit((steepness - limit[:, :1])"),
     Fault("the loss of a bound is clipped a second time", "planning/problem.py",

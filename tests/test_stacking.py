@@ -86,7 +86,7 @@ def written(missions, folder):
 
 CALLS = {
     "fit": lambda m, r: few_draws(m)["posterior"].to_dataset(),
-    "fit_hazard": lambda m, r: tb.hazard.fit_hazard(m, random_cells(n=10))["p_fail"],
+    "fit_hazard": lambda m, r: tb.hazard.fit_hazard(m, random_cells(n=10))["intercept"],
     "score": lambda m, r: tb.inference.score(r("posterior"), m),
     "check": lambda m, r: tb.check(r("posterior"), missions=m).table,
     "add_latent": lambda m, r: tb.inference.add_latent(r("posterior"), m, progress=False)[
@@ -155,6 +155,6 @@ def test_earlier_and_lost_missions_may_be_in_any_iterable(missions):
 
     lost = [LostMission(missions[0].path)]
     workspace = random_cells(n=10)
-    expected = tb.hazard.fit_hazard(missions, workspace, lost=lost)["p_fail"]
-    found = tb.hazard.fit_hazard(missions, workspace, lost=iter(lost))["p_fail"]
+    expected = tb.hazard.fit_hazard(missions, workspace, lost=lost)["intercept"]
+    found = tb.hazard.fit_hazard(missions, workspace, lost=iter(lost))["intercept"]
     np.testing.assert_array_equal(found, expected)
