@@ -100,7 +100,8 @@ def refreshing(shown: tqdm, step: int = 0) -> Iterator[None]:
 
     def refresh() -> None:
         while not done.wait(1.0):
-            shown.update(step)
+            if step:
+                shown.update(step)
             if not shown.delay:
                 shown.refresh()
 

@@ -68,7 +68,7 @@ class _Announcement(event.Listener):
     def on_start(self, event: event.Event) -> None:
         details: Any = event.data
         function = details["dispatcher"].py_func
-        if function.__module__.startswith("trustbo."):
+        if str(function.__module__).startswith("trustbo."):  # None in a namespace of its own
             say_once("First use: compiling kernels (about 30 s, stored for later).")
 
     def on_end(self, event: event.Event) -> None:

@@ -96,6 +96,13 @@ def test_only_attempted_and_planned_bounds_are_measured_until_failures_matter(tm
         again.save(tmp_path / "copy")
     assert tb.load_result(tmp_path / "copy").workspace.difficulty.is_whole
 
+    (tmp_path / "difficulty.nc").write_bytes(b"damaged")
+    with pytest.warns(UserWarning, match="difficulty"):
+        again = tb.Campaign.load(tmp_path)
+    assert not again.workspace.difficulty.is_whole
+    assert len(again.missions) == len(campaign.missions)
+    again.close()
+
 
 def test_mission_without_a_report_is_learned_from_if_a_bound_failed(workspace):
     campaign = begin(workspace)

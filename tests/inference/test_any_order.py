@@ -11,6 +11,7 @@ from worlds import random_cells
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import TrustFilter, params_of
+from trustbo.inference.draws import as_fitted
 from trustbo.models import ContactRate, CoupledTrust
 
 PATH = [(4, 0), (3, 1), (2, 2), (1, 3), (0, 4)]
@@ -20,7 +21,7 @@ QUIET = {"seed": 0, "check": False, "progress": False}
 def of_robots(awareness, contact_rate=None):
     """Each robot has weights of its own, whose axes are in an unusual order."""
     n_robots, n_features = awareness.shape[2:]
-    with numpyro.plate("feature", n_features, dim=-2), numpyro.plate("robot", n_robots, dim=-1):
+    with numpyro.plate("features", n_features, dim=-2), numpyro.plate("robot", n_robots, dim=-1):
         weight = numpyro.sample("weight", dist.Normal(0.2, 0.3))
     drift = (awareness * weight.T).sum(-1)
     with numpyro.plate("mission", len(awareness)):
@@ -102,6 +103,13 @@ def test_any_order_of_labels_gives_the_same(posterior, expected, missions, works
     found = found_with(shuffled(posterior, seed), missions, workspace)
     for name, values in expected.items():
         np.testing.assert_allclose(found[name], values, rtol=1e-9, atol=1e-12, err_msg=name)
+
+
+def test_a_posterior_is_read_in_the_order_of_its_fit(posterior):
+    """Also where the axis of robots or features has another name, such as that of a plate."""
+    for tree in (posterior, shuffled(posterior, 4)):
+        found = as_fitted("the test", tree)["posterior"].to_dataset()
+        xr.testing.assert_equal(found, posterior["posterior"].to_dataset())
 
 
 def test_checks_and_curves_do_not_depend_on_the_order(posterior):

@@ -19,7 +19,7 @@ from trustbo.campaign.record import (
 )
 from trustbo.campaign.replace import has_campaign, is_being_replaced, recover
 from trustbo.campaign.state import Entry, Posterior, State, StoredFile
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, warn
 from trustbo.files import FilePath, interpreting, read_file, to_path
 from trustbo.logs.netcdf import missions_from_tree, read_tree
 from trustbo.planning.plan import plan_from_record
@@ -79,10 +79,8 @@ def read_campaign(
     tree = read_tree(folder / WORKSPACE, files.get(WORKSPACE, ""))
     with interpreting(folder / WORKSPACE):
         workspace = workspace_from_tree(tree)
-    if DIFFICULTY in files:
-        tree = read_tree(folder / DIFFICULTY, files[DIFFICULTY])
-        with interpreting(folder / DIFFICULTY):
-            restore_difficulty(workspace, tree)
+    if DIFFICULTY in files and not _restore_difficulty(folder, workspace, files[DIFFICULTY]):
+        del files[DIFFICULTY]
 
     with interpreting(path):
         state = state_from_record(record, workspace)
@@ -101,6 +99,18 @@ def read_campaign(
 
     state.entries = entries[: len(rows)]
     return state, workspace, entries[len(rows) :], files
+
+
+def _restore_difficulty(folder: Path, workspace: Workspace, sha256: str) -> bool:
+    """Read the difficulty of bounds; warn and return False if the file cannot be read."""
+    try:
+        tree = read_tree(folder / DIFFICULTY, sha256)
+        with interpreting(folder / DIFFICULTY):
+            restore_difficulty(workspace, tree)
+    except TrustboError as error:  # it can be measured again
+        warn(f"{error} The difficulty of bounds will be measured again.")
+        return False
+    return True
 
 
 def _read_entries(

@@ -285,11 +285,15 @@ class BoundRisk(Summary):
 
         Given the hyperparameters, units fail independently, with probabilities that have Beta
         distributions. The arrival probability is averaged over the draws of the hyperparameters.
+        Probabilities of bounds that do not exist are NaN, and so is the arrival probability.
         """
         of_bounds = self._units_at(bounds_and_next(path))
         units, index = np.unique(of_bounds, axis=0, return_inverse=True)
         a, b = self._betas_of(units)
-        p_fail = (a / (a + b)).mean(0)[index]
+        exists = of_bounds[:, 3] >= 0
+        p_fail = np.where(exists, (a / (a + b)).mean(0)[index], np.nan)
+        if not exists.all():
+            return PathRisk(p_fail, np.nan, (np.nan, np.nan))
 
         # If a unit is passed several times, each pass is evidence for the next one.
         arrives = np.ones(len(a))
@@ -462,7 +466,12 @@ class Risk(Summary):
         return failure_in(self.searched, path)
 
     def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
-        """Compute the risk along a path."""
+        """Compute the risk along a path.
+
+        Without draws, the arrival probability is the product of the means 1 - p_fail. With draws,
+        this product is multiplied by the ratio of the mean of the product to the product of the
+        means, both over the draws, because failures are correlated.
+        """
         index = tuple(bounds_and_next(path).T)
         p = self.p_fail[index]
         reach = np.cumprod(1.0 - p)
@@ -510,9 +519,7 @@ class PathRisk(NamedTuple):
     p_fail: np.ndarray
     """Posterior mean probability that each bound, once begun, ends the mission, shape (bound,)."""
     p_arrive: float
-    """Probability of reaching the goal. Without draws, it is the product of the means 1 - p_fail.
-    With draws, this product is multiplied by the ratio of the mean of the product to the product of
-    the means, both over the draws, because failures are correlated."""
+    """Probability of reaching the goal."""
     p_arrive_band: tuple[float, float]
     """Ends of the 90 % band of `p_arrive` over the draws; NaN without draws."""
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from trustbo.arrays import in_order
@@ -318,7 +319,8 @@ def _in_order(
     dims: dict[str, list[str]] = {}
     if is_by_position(posterior):
         dims = json.loads(posterior["posterior"].attrs.get("dims", "{}"))
-        names |= dict.fromkeys(dim for of_variable in dims.values() for dim in of_variable)
+        for dim in {dim for of_variable in dims.values() for dim in of_variable}:
+            names |= _names_along(posterior, dim, robots, features)
     else:
         for effect in effects_of(posterior):
             names |= effect.coords
@@ -347,6 +349,26 @@ def _in_order(
     whole = xr.DataTree.from_dict(groups | changed)
     whole.attrs = posterior.attrs | {"robots": list(robots), "features": list(features)}
     return whole
+
+
+def _names_along(
+    posterior: xr.DataTree, axis: str, robots: Sequence[str], features: Sequence[str]
+) -> dict[str, Sequence[Any] | None]:
+    """Return the order of an axis of a function for `in_order`; empty if it has no known order.
+
+    Axes of robots and features may have other names, such as that of the plate "robots".
+    """
+    index = posterior["posterior"].to_dataset().indexes.get(axis)
+    if index is None:
+        return {}
+    if pd.api.types.is_numeric_dtype(index):
+        return {axis: None}
+
+    labels = {str(label) for label in index}
+    for of_axis in (robots, features):
+        if labels == set(of_axis):
+            return {axis: of_axis}
+    return {}
 
 
 def _transposed(group: xr.Dataset, dims: Mapping[str, Sequence[str]]) -> xr.Dataset:

@@ -121,7 +121,6 @@ def robots_in_bounds_of(
         n_bounds = group.sizes["bound"]
         column[*_bounds(group)] = np.arange(n_bounds)
         known = group["place_robot"].astype(float)
-        known = known - known.mean("robot")  # 0 but for the rounding to single precision
         known = known.sel(robot=list(robots)).transpose("chain", "draw", "robot", "bound")
         known = known.values.reshape(len(tau_r), len(robots), n_bounds)
 

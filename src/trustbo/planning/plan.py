@@ -1,5 +1,6 @@
 """A plan: a path with its expected trust and value, and the routes of the robots."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -14,6 +15,7 @@ from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
 """Quantile levels of `Plan.bands`: the ends of the 90 % and the 50 % bands."""
+_ROUNDING = 1e-9  # relative; the draws of a path and of a single bound are averaged differently
 
 
 class PastFailure(NamedTuple):
@@ -201,7 +203,11 @@ def past_failures_of(plan: Plan) -> list[str]:
     for k, failures in of_bounds.items():
         left, entered = plan.path[k - 1 : k + 1]
         p = float(p_fail[k - 1])
-        same = [failure for failure in failures if failure.way[0] == left and failure.p_fail == p]
+        same = [
+            failure
+            for failure in failures
+            if failure.way[0] == left and math.isclose(failure.p_fail, p, rel_tol=_ROUNDING)
+        ]
         text = (
             f"bound {k} enters {path_text([entered])} from {path_text([left])} with failure "
             f"probability {p:.2g}{_when(same)}"

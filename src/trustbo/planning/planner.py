@@ -243,6 +243,8 @@ class Planner(Summary):
                 weights of the components do not sum to 1.
         """
         if isinstance(p_fail, BoundRisk):
+            if draws is not None or components is not None:
+                raise TrustboError("give a BoundRisk without draws= and components=; it has both.")
             return self._with(risk=p_fail)
 
         mean = read_risk("p_fail", p_fail)

@@ -32,7 +32,7 @@ class WholePlates(Messenger):
             )
 
     def postprocess_message(self, msg: Any) -> None:
-        """Raise TrustboError if a plate has fewer indices than its size, or other ones."""
+        """Raise TrustboError if a plate has fewer indices than its size."""
         if msg["type"] != "plate":
             return
 
