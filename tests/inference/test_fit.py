@@ -133,7 +133,7 @@ def test_forecasts_have_the_effects_of_robots_in_bounds_and_plans_those_of_the_t
     expected, drawn = params_of(posterior), params_of(posterior, next_mission=True)
     assert expected.place_robot is None
     of_robots = drawn.place_robot.everywhere()
-    np.testing.assert_allclose(of_robots.sum(1), 0.0, atol=1e-12)
+    np.testing.assert_allclose(of_robots.sum(1), 0.0, atol=1e-7)  # stored in single precision
 
     places = posterior["places"].to_dataset().stack(one=("chain", "draw"))
     bounds = [places[f"bound_{name}"].values for name in ("move", "row", "col")]

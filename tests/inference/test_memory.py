@@ -111,7 +111,8 @@ def test_likelihoods_are_those_of_a_chain_of_deviations(deviations):
         offset = offset + d[j] * mission.awareness[..., 0]
         expected = mission_of(form, drift, offset).log_density(mission.contact_rate)
         found = posterior["log_likelihood"]["contact_rate"].values[0, 7, j]
-        np.testing.assert_allclose(found, expected, rtol=1e-9)
+        # Effects of robots in bounds are stored in single precision.
+        np.testing.assert_allclose(found, expected, rtol=1e-8)
 
 
 def test_scores_are_of_deviations_that_last(deviations):
