@@ -312,13 +312,12 @@ def evidence(
 def whiten(blocks: Blocks, predictor: LinearPredictor, lam: Any) -> tuple[Any, Any]:
     """Return whitening matrices W (point, kind, row, row) and log densities at zero residual."""
     V = each(predictor.covariance, blocks.label)
-    xp = namespace(V)
     some = lam > 0.0
-    d = xp.where(some, xp.where(some, lam, 1.0) ** 0.5, 0.0)  # lam**0.5 has no slope at 0
+    d = np.where(some, lam, 0.0) ** 0.5
 
     L = cholesky(np.eye(V.shape[-1]) + d[..., :, None] * V * d[..., None, :])
-    log_sites = 0.5 * xp.log(xp.where(some, lam, 2.0 * np.pi) / (2.0 * np.pi)).sum(-1)
-    return xp.linalg.inv(L) * d[..., None, :], log_sites - log_diagonal(L)
+    log_sites = 0.5 * np.log(np.where(some, lam, 2.0 * np.pi) / (2.0 * np.pi)).sum(-1)
+    return np.linalg.inv(L) * d[..., None, :], log_sites - log_diagonal(L)
 
 
 def inputs(blocks: Blocks, c: np.ndarray) -> np.ndarray:

@@ -1,9 +1,8 @@
-"""Dense Cholesky factors of covariances and precisions, in NumPy and JAX."""
+"""Dense Cholesky factors of covariances and precisions."""
 
 from functools import cache
 from typing import Any
 
-import jax
 import numpy as np
 
 from trustbo.models.backend import inverse_and_log_det
@@ -17,23 +16,20 @@ def upper(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def log_diagonal(L: Any) -> Any:
-    """Compute the log determinants of triangular matrices."""
+    """Compute the log determinants of triangular matrices, in NumPy or JAX."""
     xp = namespace(L)
     return xp.log(xp.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
 
 
 def log_det(A: Any) -> Any:
-    """Compute the log determinants of positive definite matrices."""
+    """Compute the log determinants of positive definite matrices, in NumPy or JAX."""
     if not isinstance(A, np.ndarray):
         return inverse_and_log_det(A)[1]
     return 2.0 * log_diagonal(cholesky(A))
 
 
-def cholesky(A: Any) -> Any:
+def cholesky(A: np.ndarray) -> np.ndarray:
     """Compute lower Cholesky factors, with NaN where a matrix is not positive definite."""
-    if not isinstance(A, np.ndarray):
-        return jax.lax.linalg.cholesky(A, symmetrize_input=False)
-
     try:
         return np.linalg.cholesky(A)
     except np.linalg.LinAlgError:  # one bad point must not invalidate the others
