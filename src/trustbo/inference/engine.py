@@ -284,13 +284,36 @@ def evidence(
         y: Site means (point, block, row), if different from the observations.
     """
     W, log_sites = whiten(blocks, predictor, lam)
-    n = len(W)
     b = blocks
-
-    # Regression of W (y - m) on C U with unit noise, where C = W T, about the prior mean.
     residual = (b.y if y is None else y) - expected(b, predictor, prior.mean)
+    F, half, w = regress(b, W, residual, each(predictor.response, b.label), prior.parts)
+
+    n_of_kind = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
+    log_p = log_sites @ n_of_kind + 0.5 * (prior.log_det - (w**2).sum((1, 2)))
+
+    # With A = F F', integrating over c adds h' A^-1 h / 2 = |F^-1 h|^2 / 2 and -log |F|.
+    return Fit(log_p + 0.5 * (half**2).sum(1) - F.log_det, F, half, W)
+
+
+def regress(
+    blocks: Blocks, W: np.ndarray, residual: np.ndarray, T: np.ndarray, parts: Sequence[Any]
+) -> tuple[Factor, np.ndarray, np.ndarray]:
+    """Regress whitened residuals w = W (y - m) on C U with unit noise, where C = W T.
+
+    Args:
+        blocks: Data of all blocks.
+        W: Whitening matrices (point, kind, row, row).
+        residual: Residuals y - m at the prior mean (point, block, row).
+        T: Responses (point, kind, row, input).
+        parts: Parts of the prior precision; see `Prior`.
+
+    Returns:
+        The factor F of the posterior precision of the coefficients, F^-1 h with h = U' C' w, and w.
+    """
+    b = blocks
+    n = len(W)
     w = (W[:, b.kind] @ residual[..., None])[..., 0]
-    C = W @ each(predictor.response, b.label)
+    C = W @ T
 
     # h = U' C' w
     back = (np.swapaxes(C, 2, 3)[:, b.kind] @ w[..., None])[..., 0]
@@ -298,15 +321,9 @@ def evidence(
 
     # A = U' C' C U + prior precision, from products of columns that do not depend on theta.
     pairs = (np.swapaxes(C, 2, 3) @ C)[:, :, *upper(C.shape[3])]
-    A = b.precision(pairs.reshape(n, -1), prior.parts)
-
-    n_of_kind = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
-    log_p = log_sites @ n_of_kind + 0.5 * (prior.log_det - (w**2).sum((1, 2)))
-
-    # With A = F F', integrating over c adds h' A^-1 h / 2 = |F^-1 h|^2 / 2 and -log |F|.
+    A = b.precision(pairs.reshape(n, -1), parts)
     F = Factor.from_precision(b.order, A)
-    half = F.forward(h)
-    return Fit(log_p + 0.5 * (half**2).sum(1) - F.log_det, F, half, W)
+    return F, F.forward(h), w
 
 
 def whiten(blocks: Blocks, predictor: LinearPredictor, lam: Any) -> tuple[Any, Any]:

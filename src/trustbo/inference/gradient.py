@@ -19,9 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from trustbo.inference.engine import Blocks, Prior, covariance_of_inputs, inputs
+from trustbo.inference.engine import Blocks, Prior, covariance_of_inputs, inputs, regress
 from trustbo.inference.factor import cholesky, log_diagonal, upper
-from trustbo.inference.sparse import Factor
 from trustbo.statespace.blocks import LinearPredictor, each
 
 
@@ -145,22 +144,13 @@ def _value(blocks: Blocks, *arguments: np.ndarray) -> tuple[np.ndarray, tuple[An
     """
     m, T, V, mean, *parts = arguments
     b = blocks
-    n = len(m)
     L = cholesky(V)
     W = np.linalg.inv(L) * b.seen[:, None]
 
-    # Residuals at the prior mean; the rest is as in `engine.evidence`.
+    # Residuals at the prior mean.
     off = inputs(b, mean)
     first = b.y - m[:, b.kind] - (T[:, b.kind] @ off[..., None])[..., 0]
-    w = (W[:, b.kind] @ first[..., None])[..., 0]
-    C = W @ T
-    back = (np.swapaxes(C, 2, 3)[:, b.kind] @ w[..., None])[..., 0]
-    h = (b.U.T @ back.reshape(n, -1).T).T
-
-    pairs = (np.swapaxes(C, 2, 3) @ C)[:, :, *upper(T.shape[3])]
-    A = b.precision(pairs.reshape(n, -1), parts)
-    F = Factor.from_precision(b.order, A)
-    half = F.forward(h)
+    F, half, w = regress(b, W, first, T, parts)
 
     n_of_kind = np.bincount(b.kind, minlength=len(b.seen)).astype(float)
     of_rates = 2.0 * log_diagonal(L) + np.log(2.0 * np.pi) * b.seen.sum(1)
