@@ -21,7 +21,8 @@ about delta_w and delta_v separately. The other rates are simulated from the mod
 All peers together take some 30 minutes of CPU time; set NPROC=1 to run JAX in one thread.
 `memory`: bytes of a posterior of 60 missions on random paths, with all groups and with the
 parameters alone, and of the parameters after 60 missions on 10 paths, as a campaign keeps them
-after each mission.
+after each mission. Also bytes that a campaign of `trustbo demo` keeps per mission, missions 11 to
+40, in memory and with a folder.
 `busy`: wall time of a fit to 60 missions with all groups, alone and beside two processes that
 always compute. If three processes share two cores fairly, the ratio is 1.5.
 `filter`: time to update the filter with one bound of three robots, with 1000 draws.
@@ -29,9 +30,12 @@ always compute. If three processes share two cores fairly, the ratio is 1.5.
 The peers are installed by `pip install trustbo[bench]`; a peer that is missing is left out.
 """
 
+import gc
 import subprocess
 import sys
+import tempfile
 import time
+import tracemalloc
 from importlib import import_module
 
 import numpy as np
@@ -312,6 +316,27 @@ def memory(given):
     options = {"draws": 250, "latent": False, "check": False}
     repeated = tb.fit(missions(60, n_paths=10), DEFAULT, **options)
     table.row("parameters, 10 paths", f"{parameters_alone(repeated).nbytes / 1e6:.2f}")
+
+    with tempfile.TemporaryDirectory() as folder:
+        for directory in None, folder:
+            where = "with a folder" if directory else "in memory"
+            table.row(f"campaign, per mission, {where}", f"{kept_per_mission(directory):.2f}")
+
+
+def kept_per_mission(directory):
+    """MB that a campaign adds to the memory of Python per mission, from mission 11 to 40."""
+    workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10))
+    campaign = tb.Campaign(workspace, (9, 0), (0, 9), directory=directory, progress=False)
+    sizes = []
+    tracemalloc.start()
+    with campaign:
+        for n in 10, 40:
+            for _ in campaign.run(n_iterations=n):
+                pass
+            gc.collect()
+            sizes.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    return (sizes[1] - sizes[0]) / 30e6
 
 
 def busy(given):

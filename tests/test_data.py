@@ -168,6 +168,17 @@ def test_a_mission_takes_another_awareness_and_keeps_its_rates():
     np.testing.assert_array_equal(found.contact_rate, y)
 
 
+def test_a_mission_with_another_awareness_shares_its_ticks():
+    poses, contact = np.zeros((5, 3, 3)), np.ones((5, 2))
+    z = np.full((2, 2), 0.5)
+    bound = Bound((0, 1), z, np.ones(2), np.ones(2), poses=poses, contact=contact)
+    mission = Mission(((0, 0), (0, 1)), (bound,))
+    [changed] = mission.with_awareness(z[None] / 2.0).bounds
+    np.testing.assert_array_equal(changed.awareness, z / 2.0)
+    assert changed.poses is bound.poses
+    assert changed.contact is bound.contact
+
+
 def test_a_scale_of_reports_is_checked():
     mission = Mission.from_arrays(None, *arrays())
     assert replace(mission, scale="likert5").scale == "likert5"

@@ -346,7 +346,7 @@ class Mission(Summary):
         names = {"robot": self.robots, "feature": self.features}
         read = read_labelled("awareness", awareness, ("bound", "robot", "feature"), names)
         bounds = zip(self.bounds, read.values, strict=True)
-        return replace(self, bounds=tuple(replace(bound, awareness=z) for bound, z in bounds))
+        return replace(self, bounds=tuple(_with_awareness(bound, z) for bound, z in bounds))
 
     def in_order(
         self, robots: Sequence[str], features: Sequence[str], unmeasured: Sequence[str]
@@ -524,6 +524,14 @@ def require_shares(rate: np.ndarray, ticks: np.ndarray) -> np.ndarray:
             "give all decimals, or leave n_ticks out."
         )
     return ticks
+
+
+def _with_awareness(bound: Bound, awareness: np.ndarray) -> Bound:
+    """Return a bound with another awareness; both share the ticks, which take most memory."""
+    changed = replace(bound, awareness=awareness, poses=None, contact=None)
+    object.__setattr__(changed, "poses", bound.poses)
+    object.__setattr__(changed, "contact", bound.contact)
+    return changed
 
 
 def _require_recorded(n_robots: int, poses: Any, contact: Any) -> None:

@@ -127,6 +127,18 @@ def test_effects_of_places_are_stored_in_a_thousand_draws_of_single_precision():
     assert {values.dtype for values in places.data_vars.values()} == {np.dtype(np.float32)}
 
 
+def test_parameters_do_not_keep_the_arrays_of_effects_in_memory():
+    effects = PlaceEffect(), RobotEffect()
+    missions = walking_missions(0, 3)
+    posterior = fit(missions, PooledTrust(effects=effects), latent=False, progress=False)
+    group = posterior["posterior"].to_dataset()
+    for name, variable in group.data_vars.items():
+        array = variable.values
+        while array.base is not None:
+            array = array.base
+        assert array.nbytes <= group.nbytes, name
+
+
 def test_forecasts_have_the_effects_of_robots_in_bounds_and_plans_those_of_the_team():
     missions = walking_missions(0, 3)
     posterior = fit(missions, PooledTrust(effects=PlaceEffect()), latent=False, **QUIET)

@@ -19,7 +19,8 @@ def to_variables(density: Density, draws: JointDraws) -> dict[str, dict[str, np.
     groups = {"posterior": _hyperparameters(density, theta)}
     ends = zip(density.ends[:-1], density.ends[1:], strict=True)
     for effect, (start, end) in zip(density.model.terms, ends, strict=True):
-        of_effect = effect.to_variables(draws.c[:, start:end], theta, density.observations)
+        own = draws.c[:, start:end].copy()  # a view would keep all columns in memory
+        of_effect = effect.to_variables(own, theta, density.observations)
         if effect.group:
             of_effect = {name: v.astype(np.float32) for name, v in of_effect.items()}
         groups.setdefault(effect.group or "posterior", {}).update(of_effect)
