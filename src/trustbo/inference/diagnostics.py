@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from arviz_stats import sampling_diagnostics
 
-from trustbo.inference.draws import as_fitted
+from trustbo.inference.draws import require_fitted
 
 MAX_RHAT = 1.01
 """Largest rank-normalised R-hat that is accepted for NUTS."""
@@ -38,7 +38,7 @@ def diagnostics(posterior: xr.DataTree) -> dict[str, float]:
     Raises:
         TrustboError: If the posterior is not from `fit`.
     """
-    attrs = as_fitted("diagnostics", posterior).attrs
+    attrs = require_fitted("diagnostics", posterior).attrs
     names = ("k_hat", "kish") if attrs["sampler"] == "importance" else NUTS_NAMES
     return {name: float(attrs[name]) for name in names}
 

@@ -58,6 +58,15 @@ def as_fitted(who: str, value: object) -> xr.DataTree:
         TrustboError: If the value is not a posterior from `fit`, it has no draws, or a robot or
             feature has another name than in the fit. The message names `who`.
     """
+    posterior = require_fitted(who, value)
+    return _in_order(posterior, names_in(posterior, "robot"), names_in(posterior, "feature"))
+
+
+def require_fitted(who: str, value: object) -> xr.DataTree:
+    """Return a posterior from `fit` as it is, for callers that read only its attributes.
+
+    Raises TrustboError if the value is not a posterior from `fit`, or if it has no draws.
+    """
     if not isinstance(value, xr.DataTree):
         remedy = " Give the attribute .posterior." if hasattr(value, "posterior") else ""
         raise TrustboError(f"{who} needs a posterior from fit; got {type(value).__name__}.{remedy}")
@@ -78,7 +87,7 @@ def as_fitted(who: str, value: object) -> xr.DataTree:
             f"{who} needs the draws of a posterior, with the dims chain and draw, but there is no "
             f"{lacks[0]}. Keep all draws, or select with a list, such as posterior.isel(chain=[0])."
         )
-    return _in_order(value, names_in(value, "robot"), names_in(value, "feature"))
+    return value
 
 
 def parameters_of(

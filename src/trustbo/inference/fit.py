@@ -21,7 +21,7 @@ from trustbo.errors import (
     require_whole,
 )
 from trustbo.inference.density import SWEEPS, Coefficients, Density, JointDraws
-from trustbo.inference.draws import as_fitted, names_in
+from trustbo.inference.draws import as_fitted, names_in, require_fitted
 from trustbo.inference.functions.fit import (
     fit_function,
     require_poolable_with_function,
@@ -181,6 +181,8 @@ def fit(
         require_poolable_with_function(function, earlier, robots)
         if sampler not in (None, "nuts"):
             raise TrustboError(f"a NumPyro function is sampled by 'nuts'; got {sampler!r}.")
+        if start is not None:
+            start = as_fitted("start", start)  # its draws are read by position
         tree, complaints = fit_function(
             missions, function, workspace, draws, chains, warmup, seed, progress, check, start
         )
@@ -208,11 +210,11 @@ def fit(
 
 
 def _same_names(start: xr.DataTree | None, mission: Mission) -> xr.DataTree | None:
-    """Return `start` in the order of its fit, or None if its scores belong to other names."""
+    """Return `start`, or None if its scores belong to other names."""
     if start is None:
         return None
 
-    start = as_fitted("start", start)
+    start = require_fitted("start", start)
     same_robots = names_in(start, "robot") in ((), mission.robots)
     same_features = names_in(start, "feature") in ((), mission.features)
     return start if same_robots and same_features else None
