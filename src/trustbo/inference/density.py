@@ -190,7 +190,9 @@ class Density:
                 fit, _ = self._fit(chunk)
                 log_p[where] = fit.log_p
             else:
-                log_p[where], _ = ep.log_evidence(self._joint(chunk), self.sites, SWEEPS)
+                joint = self._joint(chunk)
+                sites = ep.swept(joint, self.sites, SWEEPS)
+                log_p[where] = ep.log_evidence(joint, sites)
         return log_p
 
     def reset_ep(self) -> None:
@@ -202,8 +204,7 @@ class Density:
         """Find the EP sites at the mean of theta, for use as initial sites at all other points."""
         if not self.exact:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
-            joint = self._joint(center)
-            _, self.sites = ep.log_evidence(joint, self.sites, _SETTLED, _DAMPING)
+            self.sites = ep.swept(self._joint(center), self.sites, _SETTLED, _DAMPING)
 
     def start(self) -> np.ndarray:
         """Return a starting point for the search for the mode or, with EP, the mode itself.
@@ -268,7 +269,7 @@ class Density:
         parts = []
         for _, chunk in chunks(theta):
             joint = self._joint(chunk)
-            _, sites = ep.log_evidence(joint, self.sites, n_sweeps)
+            sites = ep.swept(joint, self.sites, n_sweeps)
             parts.append(ep.draw(joint, sites, rng))
 
         c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))

@@ -100,42 +100,67 @@ def _matched(
     return Sites(lam, eta)
 
 
-def log_evidence(
-    joint: Joint, sites: Sites, n_sweeps: int, damp: float = 1.0
-) -> tuple[np.ndarray, Sites]:
-    """Compute the EP log evidence (point,) and the sites after `n_sweeps` sweeps.
-
-    A sweep updates all sites at once (parallel EP). After the last sweep, only the evidence is
-    computed.
-    """
-    blocks, predictor, prior, rates = joint
-    seen = ~np.isnan(rates.y)
-    sd = predictor.noise_sd
+def swept(joint: Joint, sites: Sites, n_sweeps: int, damp: float = 1.0) -> Sites:
+    """Return the sites at each theta after `n_sweeps` sweeps, which each update all of them."""
+    rates = joint.rates
+    sd = joint.predictor.noise_sd
     sites = sites.at(rates, sd)
+    for _ in range(n_sweeps):
+        _, cavity = _cavities(joint, sites)
+        _, mean, var = rates.likelihood.moment_match(
+            rates.y, rates.n_ticks, cavity.mean, cavity.var, sd
+        )
 
-    log_p = np.zeros(len(sd))
-    for sweep in range(n_sweeps + 1):
+        # The site that gives these moments (Rasmussen and Williams 2006, equation 3.59), damped.
+        var = np.maximum(var, _LEAST_VARIANCE)
+        new = _matched(rates, cavity.precision, cavity.slope, mean, var)
         lam, eta = sites
-        y = sites.y
-        fit = evidence(blocks, predictor, prior, lam, y)
-        mean, var = marginals(blocks, predictor, prior, fit, y)
+        sites = Sites(lam + damp * (new.lam - lam), eta + damp * (new.eta - eta)).at(rates, sd)
+    return sites
 
-        # Cavity: divide the marginal by its site (Rasmussen and Williams 2006, equation 3.56).
-        rest = np.maximum(1.0 / var - lam, _LEAST)
-        slope = mean / var - eta
-        m = slope / rest
-        v = 1.0 / rest
 
-        # Moments of the cavity times the likelihood term, and the log evidence (3.57 and 3.65).
-        log_mass, mean, var = rates.likelihood.moment_match(rates.y, rates.n_ticks, m, v, sd)
-        log_p = fit.log_p + np.where(seen, log_mass - _overlap(y, lam, m, v), 0.0).sum((1, 2))
+def log_evidence(joint: Joint, sites: Sites) -> np.ndarray:
+    """Compute the EP log evidence (point,) with the given sites."""
+    rates = joint.rates
+    seen = ~np.isnan(rates.y)
+    sd = joint.predictor.noise_sd
+    sites = sites.at(rates, sd)
+    log_sites, cavity = _cavities(joint, sites)
 
-        # The site that gives these moments (3.59), damped.
-        if sweep < n_sweeps:
-            new = _matched(rates, rest, slope, mean, np.maximum(var, _LEAST_VARIANCE))
-            sites = Sites(lam + damp * (new.lam - lam), eta + damp * (new.eta - eta))
-            sites = sites.at(rates, sd)
-    return log_p, sites
+    # The ratio of the masses of the cavity times the likelihood term and times the site (3.65).
+    m = cavity.mean
+    v = cavity.var
+    log_mass, _, _ = rates.likelihood.moment_match(rates.y, rates.n_ticks, m, v, sd)
+    ratio = log_mass - _overlap(sites.y, sites.lam, m, v)
+    return log_sites + np.where(seen, ratio, 0.0).sum((1, 2))
+
+
+class _Cavities(NamedTuple):
+    """Normal distributions (point, block, row) of the predictors without the site of each one."""
+
+    precision: np.ndarray
+    slope: np.ndarray  # mean times precision
+
+    @property
+    def mean(self) -> np.ndarray:
+        return self.slope / self.precision
+
+    @property
+    def var(self) -> np.ndarray:
+        return 1.0 / self.precision
+
+
+def _cavities(joint: Joint, sites: Sites) -> tuple[np.ndarray, _Cavities]:
+    """Return the log evidence (point,) of the sites, and the cavities."""
+    blocks, predictor, prior, _ = joint
+    lam, eta = sites
+    y = sites.y
+    fit = evidence(blocks, predictor, prior, lam, y)
+    mean, var = marginals(blocks, predictor, prior, fit, y)
+
+    # Divide the marginal by its site (Rasmussen and Williams 2006, equation 3.56).
+    precision = np.maximum(1.0 / var - lam, _LEAST)
+    return fit.log_p, _Cavities(precision, mean / var - eta)
 
 
 def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -120,7 +120,7 @@ def _ep_trust(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw trust given non-Gaussian rates by weighted particles; see `_exact_trust`."""
     joint = ep.Joint(density.blocks, predictor, density.prior(theta), density.rates)
-    _, sites = ep.log_evidence(joint, density.sites, SWEEPS)
+    sites = ep.swept(joint, density.sites, SWEEPS)
 
     # Draw particles of the predictor f; for each block, Gumbel noise chooses one by weight.
     drawn = [ep.draw_predictors(joint, mean, sites, rng) for _ in range(_PARTICLES)]
