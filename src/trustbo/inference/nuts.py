@@ -36,12 +36,14 @@ _WARMUP_OF_STEP = 150
 """Number of warm-up draws if only the step size is tuned."""
 _WARMUP_OF_MASS = 300
 """Number of warm-up draws if the mass matrix is also tuned."""
-_ACCEPT = 0.9
-"""Target of the acceptance probability."""
-_DEPTH = 3
-"""Largest number of doublings of a trajectory, which then has 7 steps."""
-_FIRST_STEP = 0.4
-"""Initial step size of the warm-up, in sds."""
+_ACCEPT = 0.65
+"""Target of the acceptance probability in whitened coordinates."""
+_ACCEPT_OF_PROGRAM = 0.9
+"""Target of the acceptance probability of the full program."""
+_DEPTH = 2
+"""Largest number of doublings of a trajectory, which then has 3 steps."""
+_FIRST_STEP = 0.8
+"""Initial step size of the warm-up, in sds; three steps cross the posterior."""
 _RIDGE = 1e-6
 """Number added to the covariance of the points."""
 _SHRINK = 0.01
@@ -217,4 +219,6 @@ def _full_kernel(density: Density, z: np.ndarray) -> NUTS:
     def program() -> None:
         density.model.program(density.observations)
 
-    return NUTS(program, init_strategy=init_to_value(values=center), target_accept_prob=_ACCEPT)
+    return NUTS(
+        program, init_strategy=init_to_value(values=center), target_accept_prob=_ACCEPT_OF_PROGRAM
+    )
