@@ -115,8 +115,8 @@ def test_predicted_rates_have_the_dense_conditional_moments():
 )
 def test_gaussian_rates_sum_to_their_missions(model):
     missions = walking_missions(1)
-    warmup = {"warmup": 50} if callable(model) else {}
-    posterior = fit(missions, model, draws=25, progress=False, check=False, **warmup)
+    few = {"draws": 10, "warmup": 10} if callable(model) else {"draws": 25}
+    posterior = fit(missions, model, progress=False, check=False, **few)
     rates = by_rate(posterior)
     assert (
         rates["observed_data"].sizes["rate"] == posterior["observed_data"]["contact_rate"].count()

@@ -1,6 +1,7 @@
 """Models that are NumPyro functions: what they compute, how they are fitted, what is refused."""
 
 import functools
+import importlib
 import os
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from numpyro.handlers import reparam
 from numpyro.infer.reparam import LocScaleReparam
 from numpyro.infer.util import constrain_fn, log_density, potential_energy
 from scipy import stats
+from scipy.linalg import block_diag
 
 import trustbo as tb
 from trustbo.errors import PosteriorError, TrustboError
@@ -34,11 +36,14 @@ from trustbo.models.backend import own_settings
 from trustbo.models.observations import Observations
 
 FEATURES = ("traversability", "line_of_sight")
+N_DRAWS = 500
+"""Draws per chain of most fits, as a function is compiled for each number of draws."""
 
 
 def linear(awareness, contact_rate=None):
     """Drift that is linear in the features, with known noises."""
-    weight = numpyro.sample("weight", dist.Normal(0.0, 0.5).expand([2]).to_event(1))
+    n_features = awareness.shape[-1]
+    weight = numpyro.sample("weight", dist.Normal(0.0, 0.5).expand([n_features]).to_event(1))
     level = numpyro.sample("level", dist.Normal(0.0, 0.3))
     drift = awareness @ weight + level
     with numpyro.plate("mission", len(awareness)):
@@ -73,14 +78,36 @@ def missions(workspace):
 
 @pytest.fixture(scope="module")
 def posterior(missions, workspace):
-    return tb.fit(missions, linear, workspace=workspace, draws=500, progress=False)
+    return tb.fit(missions, linear, workspace=workspace, draws=N_DRAWS, progress=False)
 
 
-def exact_posterior(missions):
-    """Mean and covariance of (weight, level) from the dense normal of all rates of `linear`."""
+@pytest.fixture(scope="module")
+def of_one_robot():
+    """A posterior of `linear` for one robot and one feature."""
+    mission = tb.Mission.from_arrays(
+        [(4, k) for k in range(5)],
+        np.full((4, 1, 1), 0.5),
+        np.full((4, 1), 0.7),
+        features=("traversability",),
+    )
+    return tb.fit([mission], linear, draws=50, latent=False, check=False, progress=False)
+
+
+@pytest.fixture(scope="module")
+def with_days(missions, workspace):
+    """A posterior of `by_mission`."""
+    return tb.fit(
+        missions, by_mission, workspace=workspace, draws=N_DRAWS, check=False, progress=False
+    )
+
+
+SCALES_OF_PRIOR = np.array([0.5, 0.5, 0.3])
+"""Prior standard deviations of the weights and the level of `linear`."""
+
+
+def regressions(missions):
+    """Design, rates and covariance of each robot in each mission, given the weights of `linear`."""
     beta0, delta_w, delta_v, x0_mean, x0_sd = 0.4, 0.05, 0.05, 0.5, 0.5
-    precision = np.diag(1.0 / np.array([0.5, 0.5, 0.3]) ** 2)
-    shift = np.zeros(3)
     for mission in missions:
         n = len(mission.bounds)
         response = np.array([[beta0 ** (k - j) if j <= k else 0.0 for j in range(n)]
@@ -92,11 +119,27 @@ def exact_posterior(missions):
             design = response @ np.column_stack([mission.awareness[:, i], np.ones(n)])
             y = mission.contact_rate[:, i] - start * x0_mean
             seen = ~np.isnan(y)
-            inverse = np.linalg.inv(cov[np.ix_(seen, seen)])
-            precision += design[seen].T @ inverse @ design[seen]
-            shift += design[seen].T @ inverse @ y[seen]
+            yield design[seen], y[seen], cov[np.ix_(seen, seen)]
+
+
+def exact_posterior(missions):
+    """Mean and covariance of (weight, level) from the dense normal of all rates of `linear`."""
+    precision = np.diag(1.0 / SCALES_OF_PRIOR**2)
+    shift = np.zeros(3)
+    for design, y, cov in regressions(missions):
+        inverse = np.linalg.inv(cov)
+        precision += design.T @ inverse @ design
+        shift += design.T @ inverse @ y
     cov = np.linalg.inv(precision)
     return cov @ shift, cov
+
+
+def log_evidence(missions):
+    """Log-density of all rates of `linear`, whose weights are integrated out."""
+    designs, rates, covs = zip(*regressions(missions), strict=True)
+    design = np.concatenate(designs) * SCALES_OF_PRIOR
+    cov = block_diag(*covs) + design @ design.T
+    return stats.multivariate_normal(cov=cov).logpdf(np.concatenate(rates))
 
 
 def test_the_posterior_is_that_of_a_linear_regression(posterior, missions):
@@ -195,11 +238,24 @@ def test_draws_plan_like_the_parameters_of_a_model_class(posterior, workspace):
 
 def test_a_posterior_is_continued_from_the_last_one(posterior, missions, workspace):
     again = tb.fit(
-        missions, linear, workspace=workspace, draws=500, start=posterior, progress=False
+        missions, linear, workspace=workspace, draws=N_DRAWS, start=posterior, progress=False
     )
     mean, cov = exact_posterior(missions)
     error = 5.0 * np.sqrt(cov[2, 2] / 400.0)
     assert abs(float(again["posterior"]["level"].mean()) - mean[2]) < error
+
+
+def test_three_missions_are_left_out_by_refits_as_joint_normals_say(
+    posterior, missions, monkeypatch
+):
+    module = importlib.import_module("trustbo.inference.loo")  # the package's is the function
+    monkeypatch.setattr(module, "_N_REFIT", N_DRAWS)
+    result = tb.inference.loo(posterior)
+    assert result.elpd_i["refitted"].values.all()
+
+    whole = log_evidence(missions)
+    expected = [whole - log_evidence(missions[:j] + missions[j + 1 :]) for j in range(3)]
+    np.testing.assert_allclose(result.elpd_i, expected, atol=0.2)
 
 
 def test_a_posterior_in_a_file_needs_its_function_in_another_process(posterior, tmp_path):
@@ -279,21 +335,11 @@ def by_mission(awareness, contact_rate=None):
         numpyro.sample("contact_rate", rates, obs=contact_rate)
 
 
-def test_a_function_of_one_robot_and_one_feature_is_read_from_a_file(tmp_path):
-    def level(awareness, contact_rate=None):
-        drift = awareness[..., 0] * numpyro.sample("level", dist.Normal(0.0, 0.5))
-        with numpyro.plate("mission", len(awareness)):
-            numpyro.sample("contact_rate", ContactRate(drift, 0.4, 0.05, 0.05), obs=contact_rate)
-
+def test_a_function_of_one_robot_and_one_feature_is_read_from_a_file(of_one_robot, tmp_path):
     awareness = np.random.default_rng(0).uniform(size=(1, 5, 5, 1))
     workspace = tb.Workspace.from_awareness(awareness, features=("traversability",))
-    path = [(4, k) for k in range(5)]
-    mission = tb.Mission.from_arrays(
-        path, np.full((4, 1, 1), 0.5), np.full((4, 1), 0.7), features=workspace.features
-    )
-    fitted = tb.fit([mission], level, draws=50, latent=False, check=False, progress=False)
     file = tmp_path / "posterior.nc"
-    fitted.to_netcdf(file)
+    of_one_robot.to_netcdf(file)
     with xr.open_datatree(file) as read:
         draws = params_of(read.load(), workspace)
     assert (draws.robots, draws.features) == (("r1",), ("traversability",))
@@ -312,39 +358,25 @@ def test_missions_in_another_order_are_put_in_that_of_the_posterior(posterior, m
             tb.inference.score(tree, turned)
 
 
-def test_a_start_with_other_variables_is_ignored(missions):
-    def weights(awareness, contact_rate=None):
-        n_features = awareness.shape[-1]
-        weight = numpyro.sample("weight", dist.Normal(0.0, 0.5).expand([n_features]).to_event(1))
-        with numpyro.plate("mission", len(awareness)):
-            rates = ContactRate(awareness @ weight, 0.4, 0.05, 0.05)
-            numpyro.sample("contact_rate", rates, obs=contact_rate)
-
-    one_feature = [
-        tb.Mission.from_arrays(one.path, one.awareness[..., :1], one.contact_rate)
-        for one in missions
-    ]
-    options = {"draws": 50, "latent": False, "check": False, "progress": False}
-    start = tb.fit(one_feature, weights, **options)
-    cold = tb.fit(missions, weights, **options)
+def test_a_start_with_other_variables_is_ignored(posterior, of_one_robot, missions):
+    """There is one weight less."""
+    started = tb.fit(
+        missions, linear, start=of_one_robot, draws=N_DRAWS, latent=False, progress=False
+    )
     xr.testing.assert_identical(
-        tb.fit(missions, weights, start=start, **options)["posterior"].to_dataset(),
-        cold["posterior"].to_dataset(),
+        started["posterior"].to_dataset(), posterior["posterior"].to_dataset()
     )
 
 
-def test_variables_of_one_mission_are_drawn_for_the_next(missions, workspace):
-    fitted = tb.fit(
-        missions, by_mission, workspace=workspace, draws=500, check=False, progress=False
-    )
-    assert fitted["posterior"]["off"].dims == ("chain", "draw", "mission")
-    assert fitted["posterior"].sizes["mission"] == 3
+def test_variables_of_one_mission_are_drawn_for_the_next(with_days, workspace):
+    assert with_days["posterior"]["off"].dims == ("chain", "draw", "mission")
+    assert with_days["posterior"].sizes["mission"] == 3
 
-    draws = params_of(fitted, workspace)
+    draws = params_of(with_days, workspace)
     u = draws.inputs(workspace.awareness.values)
     known = ~np.isnan(u[0])
     assert np.ptp(u[:, known], axis=1).max() < 1e-12  # equal in all bounds of a mission
-    off = u[:, known][:, 0] - fitted["posterior"]["level"].values.ravel()
+    off = u[:, known][:, 0] - with_days["posterior"]["level"].values.ravel()
     np.testing.assert_allclose(off.std(), 0.05, rtol=0.1)
 
 
@@ -922,24 +954,22 @@ def test_a_fingerprint_tells_random_keys_apart():
     assert fingerprint(seeded[0]) != fingerprint(seeded[1])
 
 
-def test_log_priors_of_missions_leave_out_the_padding(missions):
-    fitted = tb.fit(missions, by_mission, draws=100, check=False, progress=False)
-    off = fitted["posterior"]["off"].values
+def test_log_priors_of_missions_leave_out_the_padding(with_days):
+    off = with_days["posterior"]["off"].values
     np.testing.assert_allclose(
-        fitted["log_prior"]["off"], stats.norm.logpdf(off, 0.0, 0.05).sum(-1)
+        with_days["log_prior"]["off"], stats.norm.logpdf(off, 0.0, 0.05).sum(-1)
     )
 
 
-@pytest.mark.parametrize("name", ["trust", "level/of"])
-def test_a_variable_may_have_any_name(missions, name):
+def test_a_variable_may_have_any_name(missions):
     def model(awareness, contact_rate=None):
-        a = numpyro.sample(name, dist.Normal(0.0, 1.0))
-        rates = ContactRate(a + 0.0 * awareness[..., 0], 0.4, 0.05, 0.05)
+        drift = sum(numpyro.sample(name, dist.Normal(0.0, 1.0)) for name in ("trust", "level/of"))
+        rates = ContactRate(drift + 0.0 * awareness[..., 0], 0.4, 0.05, 0.05)
         numpyro.sample("contact_rate", rates, obs=contact_rate)
 
-    fitted = tb.fit(missions, model, draws=100, check=False, progress=False)
-    assert name.replace("/", ".") in fitted["posterior"]
-    assert name.replace("/", ".") in fitted["log_prior"]
+    fitted = tb.fit(missions, model, draws=20, warmup=20, check=False, progress=False)
+    for group in ("posterior", "log_prior"):
+        assert set(fitted[group].data_vars) == {"trust", "level.of"}
 
 
 def test_a_drift_may_depend_on_the_duration(missions):
@@ -967,8 +997,8 @@ def test_a_path_may_jump_if_the_function_reads_no_moves(missions):
     jump = tb.Mission.from_arrays(
         cells, z, missions[0].contact_rate[:2], features=FEATURES, robots=missions[0].robots
     )
-    fitted = tb.fit([jump, *missions], linear, draws=100, check=False, progress=False)
-    assert fitted["posterior"]["level"].shape == (4, 100)
+    fitted = tb.fit([jump, *missions], linear, draws=N_DRAWS, check=False, progress=False)
+    assert fitted["posterior"]["level"].shape == (4, N_DRAWS)
 
     def of_moves(awareness, contact_rate=None, bound=None):
         linear(awareness, contact_rate)
