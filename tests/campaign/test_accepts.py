@@ -8,7 +8,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.crs import CRS
 
@@ -243,13 +243,19 @@ def accepts(history):
         use(OF_PREDICTION, campaign, folder, works=any(predicted))
 
 
-@example(([], 0))
-@example((["arrived", "excluded"], 0))
-@example((["no rates", "arrived", "unknown cell", "excluded", "failed", "arrived", "arrived"], 1))
-@settings(max_examples=2, deadline=None, derandomize=True)
-@given(histories())
-def test_what_tell_accepts_everything_accepts(history):
-    accepts(history)
+@pytest.mark.parametrize(
+    "events",
+    [
+        [],
+        ["arrived", "excluded"],
+        ["no rates", "arrived", "unknown cell", "excluded", "failed", "arrived", "arrived"],
+        ["failed there", "ended early", "one robot without rates", "rain"],
+        ["ended before the unknown cell", "excluded", "ended early", "excluded"],
+    ],
+    ids=lambda events: ", ".join(events) or "nothing",
+)
+def test_what_tell_accepts_everything_accepts(events):
+    accepts((events, 1))
 
 
 @pytest.mark.slow

@@ -100,6 +100,15 @@ def folder(workspace, tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module")
+def another(tmp_path_factory):
+    """Folder of another campaign."""
+    path = tmp_path_factory.mktemp("another")
+    with begin(random_cells(3, 3), path, seed=8) as campaign:
+        drive(campaign)
+    return path
+
+
 def test_campaign_that_dies_while_it_learns_learns_when_it_is_loaded(
     workspace, folder, tmp_path, monkeypatch
 ):
@@ -456,11 +465,9 @@ def test_missing_mission_before_others_is_named(folder, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["workspace.nc", "missions/0002.nc", "posteriors/0004-1.nc"])
-def test_file_of_another_campaign_is_noticed(workspace, folder, tmp_path, name):
+def test_file_of_another_campaign_is_noticed(folder, another, tmp_path, name):
     copy = shutil.copytree(folder, tmp_path / "copy")
-    with begin(random_cells(3, 3), tmp_path / "other", seed=8) as other:
-        drive(other)
-    shutil.copy(tmp_path / "other" / name, copy / name)
+    shutil.copy(another / name, copy / name)
     with pytest.raises(tb.TrustboError, match="replaced"):
         _ = tb.load_result(copy).posterior
 

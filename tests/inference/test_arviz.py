@@ -1,14 +1,12 @@
 """Groups of a posterior that ArviZ's functions read, against dense normals."""
 
 import itertools
-from importlib.metadata import version
 
 import arviz as az
 import numpy as np
 import numpyro.distributions as dist
 import pytest
 import xarray as xr
-from arviz_base.base import make_attrs
 from scipy import stats
 
 import trustbo as tb
@@ -55,18 +53,6 @@ def test_sensitivity_flags_a_prior_in_conflict_with_the_data(missions, posterior
     assert float(verdict.loc["b", "prior"]) > 0.1
     assert "✓" in other.loc["b", "diagnosis"]
     assert float(other.loc["b", "prior"]) < 0.02
-
-
-def test_a_posterior_names_its_libraries_as_arviz_does_but_not_the_time(missions, posterior):
-    written = set(make_attrs(inference_library=np)) - {"created_at"}
-    few = {"chains": 1, "draws": 10, "warmup": 10, "check": False, "latent": False}
-    by_nuts = tb.fit(missions, PooledTrust(), sampler="nuts", **few)
-    for tree, library in ((posterior, "trustbo"), (by_nuts, "numpyro")):
-        assert written <= set(tree.attrs)
-        assert "created_at" not in tree.attrs
-        assert tree.attrs["creation_library"] == "trustbo"
-        assert tree.attrs["inference_library"] == library
-        assert tree.attrs["inference_library_version"] == version(library)
 
 
 @pytest.mark.parametrize("model", [PooledTrust(), CoupledTrust()], ids=["pooled", "coupled"])

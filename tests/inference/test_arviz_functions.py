@@ -2,12 +2,14 @@
 
 import re
 import types
+from importlib.metadata import version
 from pathlib import Path
 
 import arviz as az
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from arviz_base.base import make_attrs
 
 import trustbo as tb
 from trustbo.models import PooledTrust
@@ -150,6 +152,16 @@ def test_a_function_runs_or_the_page_says_where(name, trees, request):
     else:
         with pytest.raises(Exception):  # noqa: B017, PT011
             call(name, rates)
+
+
+def test_a_posterior_names_its_libraries_as_arviz_does_but_not_the_time(trees, of_nuts):
+    written = set(make_attrs(inference_library=np)) - {"created_at"}
+    for tree, library in ((trees[0], "trustbo"), (of_nuts, "numpyro")):
+        assert written <= set(tree.attrs)
+        assert "created_at" not in tree.attrs
+        assert tree.attrs["creation_library"] == "trustbo"
+        assert tree.attrs["inference_library"] == library
+        assert tree.attrs["inference_library_version"] == version(library)
 
 
 def test_the_page_names_functions_of_arviz():
