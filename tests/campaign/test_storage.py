@@ -62,7 +62,7 @@ def test_campaign_that_dies_at_any_write_resumes_identically(
     assert len(writes) > 18
     last = {target: n for n, target in writes.items()}
     assert set(last) == {"workspace.nc", "N.nc", "N-N.nc", "campaign.json"}
-    for n in writes if every else (1, 2, 4, *last.values()):
+    for n in writes if every else sorted({1, 2, *last.values()}):
         folder = tmp_path / str(n)
         monkeypatch.setattr(os, "replace", dies_at(n))
         with pytest.raises(Dead):
