@@ -91,7 +91,8 @@ def of_one_robot():
         np.full((4, 1), 0.7),
         features=("traversability",),
     )
-    return tb.fit([mission], linear, draws=50, latent=False, check=False, progress=False)
+    with without_nuts():
+        return tb.fit([mission], linear, draws=50, latent=False, check=False, progress=False)
 
 
 @pytest.fixture(scope="module")
