@@ -6,7 +6,6 @@ import numpyro.distributions as dist
 import pytest
 import xarray as xr
 from missions import walking_missions
-from points import without_nuts
 from worlds import random_cells
 
 import trustbo as tb
@@ -53,8 +52,7 @@ def missions(workspace):
 def posterior(request, missions, workspace):
     model = {"default": None, "coupled": CoupledTrust(), "function": of_robots}[request.param]
     n_draws = 10 if request.param == "function" else 25
-    with without_nuts():
-        return tb.fit(missions, model, workspace=workspace, draws=n_draws, **QUIET)
+    return tb.fit(missions, model, workspace=workspace, draws=n_draws, **QUIET)
 
 
 def shuffled(posterior, seed):

@@ -10,7 +10,6 @@ import pytest
 import xarray as xr
 from dense_statespace import mission_of_params
 from missions import counted_missions, simulate_missions, walking_missions
-from points import without_nuts
 from scipy import stats
 
 from trustbo.errors import TrustboError
@@ -116,8 +115,7 @@ def test_predicted_rates_have_the_dense_conditional_moments():
 )
 def test_gaussian_rates_sum_to_their_missions(model):
     missions = walking_missions(1)
-    with without_nuts():
-        posterior = fit(missions, model, draws=25, progress=False, check=False)
+    posterior = fit(missions, model, draws=25, progress=False, check=False)
     rates = by_rate(posterior)
     assert (
         rates["observed_data"].sizes["rate"] == posterior["observed_data"]["contact_rate"].count()

@@ -403,7 +403,22 @@ def by_callback(b):
 )
 def test_a_function_without_gradient_is_refused_before_the_first_mission(workspace, change, reason):
     with pytest.raises(tb.TrustboError, match=f"has no gradient.*{reason}"):
-        tb.Campaign(workspace, (2, 0), (0, 2), model=of_drift(change))
+        tb.Campaign(workspace, (2, 0), (0, 2), model=of_drift(change), sampler="nuts")
+
+
+@pytest.mark.parametrize("change", [by_while_loop, by_callback])
+def test_importance_sampling_needs_no_gradient(missions, change):
+    """The drift is b / 8, or tanh(b)."""
+
+    def exact(b):
+        return b / 8.0 if change is by_while_loop else jnp.tanh(b)
+
+    fits = [
+        tb.fit(missions, of_drift(one), latent=False, progress=False) for one in (change, exact)
+    ]
+    assert [one.attrs["sampler"] for one in fits] == ["importance", "importance"]
+    found, expected = (one["posterior"]["b"] for one in fits)
+    assert abs(float(found.mean() - expected.mean())) < 0.1 * float(expected.std())
 
 
 def with_gradient(change):
@@ -415,14 +430,16 @@ def with_gradient(change):
 
 @pytest.mark.parametrize("change", [by_while_loop, by_callback])
 def test_a_function_that_defines_its_gradient_is_accepted(workspace, change):
-    tb.Campaign(workspace, (2, 0), (0, 2), model=of_drift(with_gradient(change)))
+    model = of_drift(with_gradient(change))
+    tb.Campaign(workspace, (2, 0), (0, 2), model=model, sampler="nuts")
 
 
 def test_a_gradient_that_is_not_finite_is_refused(missions):
     """The square root of 0 has an infinite slope, which is multiplied by 0."""
     model = of_drift(lambda b: jnp.sqrt(0.0 * b**2))
+    short = {"draws": 5, "warmup": 5, "chains": 1, "check": False, "progress": False}
     with pytest.raises(tb.TrustboError, match="gradient that is not finite"):
-        tb.fit(missions, model, draws=5, warmup=5, chains=1, check=False, progress=False)
+        tb.fit(missions, model, sampler="nuts", **short)
 
 
 def failing(_):

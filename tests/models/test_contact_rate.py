@@ -16,6 +16,7 @@ from unit_noise import UnitNoise
 from trustbo.errors import TrustboError
 from trustbo.models import ContactRate
 from trustbo.models.backend import own_settings
+from trustbo.models.observations import median_resolution
 
 N_ROBOTS = 3
 RNG = np.random.default_rng(0)
@@ -119,20 +120,39 @@ def test_many_drawn_rates_have_the_moments_of_the_joint_normal(delta_s):
 
 
 def test_with_numbers_of_ticks_it_has_the_probability_of_counts():
+    """The median resolution of the rates is added to the noise."""
     n_ticks = np.full(RATES.shape, 20.0)
     n_ticks[1] = 50.0
+    n_ticks[np.isnan(RATES)] = 0.0
     some = n_ticks.copy()
     some[0, 0, 0] = np.nan  # then all are densities
-    n_ticks[np.isnan(RATES)] = np.nan
-    with own_settings():
-        counted, dense = law_of("robot", "number", "number", None, n_ticks=n_ticks)
-        uncounted, _ = law_of("robot", "number", "number", None, n_ticks=some)
-        found = np.stack([law.log_prob(RATES) for law in (counted, uncounted)])
 
-    density = np.array([one.log_density(y) for one, y in zip(dense, RATES, strict=True)])
+    given = {**SHAPES["number"], "beta0": SHAPES["robot"]["beta0"], **X0}
+    found = []
+    expected = []
+    with own_settings():
+        for ticks in (n_ticks, some):
+            law = ContactRate(DRIFT, **given, offset=OFFSET, n_ticks=ticks)
+            found.append(law.log_prob(RATES))
+
+            noise = np.hypot(given["delta_v"], np.median(1.0 / ticks[ticks > 0.0]))
+            form = form_of(**{**given, "delta_v": noise}, n_robots=N_ROBOTS)
+            dense = [mission_of(form, u, o) for u, o in zip(DRIFT, OFFSET, strict=True)]
+            expected.append([one.log_density(y) for one, y in zip(dense, RATES, strict=True)])
+
     n_seen = (~np.isnan(RATES)).sum((1, 2))
-    expected = density - n_seen * np.log([20.0, 50.0])
-    np.testing.assert_allclose(found, [expected, density], rtol=1e-9)
+    expected[0] -= n_seen * np.log([20.0, 50.0])
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("ticks", [[0.0, np.nan], [40.0, 20.0, 0.0], [40.0, 20.0, 10.0], [2.0]])
+def test_the_resolution_is_the_median_of_the_counted_rates(ticks):
+    ticks = np.array(ticks)
+    counted = ticks[ticks > 0.0]
+    expected = min(np.median(1.0 / counted), 0.1) if len(counted) else 0.005
+    assert median_resolution(ticks) == pytest.approx(expected)
+    with own_settings():
+        assert float(median_resolution(jnp.asarray(ticks))) == pytest.approx(expected)
 
 
 def test_a_model_of_ones_own_is_a_numpyro_program():

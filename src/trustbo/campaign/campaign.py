@@ -159,7 +159,7 @@ class Campaign(Result):
         require_kind("hazard", hazard, Hazard, "give a trustbo.hazard.Hazard")
         options = require_options_of_planner(planner)
         fit_options = require_options_of_fit(fit)
-        learner = learner_of(model, workspace)
+        learner = learner_of(model, workspace, sampler)
         if sampler is None:
             sampler = learner.samplers[0]
         require_choice("sampler", sampler, learner.samplers)

@@ -28,6 +28,8 @@ from trustbo.inference.functions.fit import (
     with_latent_of_function,
 )
 from trustbo.inference.functions.function import as_model
+from trustbo.inference.functions.sampling import AUTO
+from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
 from trustbo.inference.importance import (
     MAX_KHAT,
     LogDensity,
@@ -110,8 +112,9 @@ def fit(
         sampler: `"importance"` takes independent draws by adaptive importance sampling. It needs no
             compilation, and integrates out all variables except hyperparameters. `"nuts"` uses
             NumPyro's NUTS, which also samples trust unless rates are Gaussian. The default is
-            `"importance"` for model classes and `"nuts"` for functions, which have no other
-            sampler.
+            `"importance"` for model classes. A function is sampled by `"importance"` with adapted
+            mixtures, by `"nuts"`, or by `"auto"`, the default: importance sampling and, where its
+            checks fail, NUTS.
         workspace: Workspace of the missions. If given, features and robots are reordered to match
             the workspace, missing awareness such as line of sight is filled in (see
             `Workspace.fill`), and place effects cover the whole grid. Missions over cells without
@@ -179,12 +182,21 @@ def fit(
     else:
         function = as_model(model)
         require_poolable_with_function(function, earlier, robots)
-        if sampler not in (None, "nuts"):
-            raise TrustboError(f"a NumPyro function is sampled by 'nuts'; got {sampler!r}.")
+        sampler = AUTO if sampler is None else require_choice("sampler", sampler, OF_FUNCTIONS)
         if start is not None:
             start = as_fitted("start", start)  # its draws are read by position
         tree, complaints = fit_function(
-            missions, function, workspace, draws, chains, warmup, seed, progress, check, start
+            missions,
+            function,
+            workspace,
+            sampler,
+            draws,
+            chains,
+            warmup,
+            seed,
+            progress,
+            check,
+            start,
         )
         add_latent = partial(
             with_latent_of_function,

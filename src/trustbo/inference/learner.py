@@ -39,6 +39,8 @@ from trustbo.inference.functions.function import (
     is_of_function,
     model_of_record,
 )
+from trustbo.inference.functions.sampling import NUTS
+from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
 from trustbo.inference.tree import parameters_alone, with_latent
 from trustbo.models.default import default_model
 from trustbo.models.draws import Draws
@@ -225,7 +227,7 @@ class ClassLearner:
 class FunctionLearner:
     """Learner of a NumPyro function."""
 
-    samplers: ClassVar[tuple[str, ...]] = ("nuts",)
+    samplers: ClassVar[tuple[str, ...]] = OF_FUNCTIONS
 
     def __init__(self, model: FunctionModel) -> None:
         self.model = model
@@ -255,11 +257,12 @@ class FunctionLearner:
         earlier: Sequence[Mission] = (),
         **options: Any,
     ) -> xr.DataTree:
-        """See `Learner.fit`; the sampler is NUTS."""
+        """See `Learner.fit`."""
         tree = fit(
             missions,
             self.model.function,
             earlier=earlier,
+            sampler=sampler,
             workspace=workspace,
             seed=seed,
             progress=progress,
@@ -305,11 +308,14 @@ class FunctionLearner:
         return self.prior_draws(_N_MEAN, 0, workspace).mean().flat()
 
 
-def learner_of(model: Model | FunctionModel | None, workspace: Workspace) -> Learner:
+def learner_of(
+    model: Model | FunctionModel | None, workspace: Workspace, sampler: str | None = None
+) -> Learner:
     """Return the learner of a model for a workspace; the default is that of the default model.
 
     Raises:
-        TrustboError: If the model is neither a trust model nor a NumPyro function, or cannot plan.
+        TrustboError: If the model is neither a trust model nor a NumPyro function, cannot plan, or
+            cannot be sampled by this sampler.
     """
     if model is None:
         return ClassLearner(default_model())
@@ -325,7 +331,7 @@ def learner_of(model: Model | FunctionModel | None, workspace: Workspace) -> Lea
         require_kind("model", model, TrustModel, remedy)
     function = as_model(model)
     require_plannable(function, workspace)
-    require_learnable(function, workspace)
+    require_learnable(function, workspace, by_gradient=sampler == NUTS)
     return FunctionLearner(function)
 
 

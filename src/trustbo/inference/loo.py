@@ -37,6 +37,7 @@ from trustbo.inference.draws import (
 from trustbo.inference.fit import by_importance
 from trustbo.inference.functions.fit import fit_function, log_likelihood_of_function
 from trustbo.inference.functions.function import FunctionModel
+from trustbo.inference.functions.sampling import AUTO
 from trustbo.inference.importance import MAX_KHAT, smoothed
 from trustbo.inference.learner import FunctionLearner, Model, add_latent, learner_of_posterior
 from trustbo.inference.tree import LIKELIHOOD_OF, RATES, TICKS
@@ -315,7 +316,7 @@ def _of_function(posterior: xr.DataTree, model: FunctionModel) -> LeftOut:
         """Average p(y_j | theta) over draws of a fit in which mission j has no rates."""
         others = [_unmeasured(one) if i == j else one for i, one in enumerate(missions)]
         fitted, complaints = fit_function(
-            others, model, None, _N_REFIT, _CHAINS, None, seed, False, True, posterior
+            others, model, None, AUTO, _N_REFIT, _CHAINS, None, seed, False, True, posterior
         )
         if complaints:
             warn(f"the refit of {model.in_short()} without mission {j}: {'; '.join(complaints)}.")

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
 from trustbo.errors import OldName, TrustboError
+from trustbo.models.observations import median_resolution
 from trustbo.statespace import Inputs, StateSpace, kalman
 from trustbo.statespace.form import coupled_robots, independent_robots
 from trustbo.statespace.matrices import apply, root
@@ -63,6 +64,7 @@ class ContactRate(dist.Distribution):
 
     support = constraints.independent(constraints.real, 2)  # pyright: ignore
     pytree_data_fields = ("inputs", "n_ticks", "space")
+    pytree_aux_fields = ("adds_resolution",)
 
     @jax.numpy_rank_promotion("allow")
     def __init__(
@@ -95,9 +97,12 @@ class ContactRate(dist.Distribution):
                 `offset`, with a drift of zeros and x0_mean = 0.
             delta_s: Standard deviation of the noise s that all robots share, shape (), or None.
             n_ticks: Number of ticks of each rate, in the shape of `drift`. A model function passes
-                its input `n_ticks`; other values are refused in fits. If every measured rate
-                has one, `log_prob` refers to the tick counts, like the log-likelihoods of `fit`;
-                otherwise, it is the log density of the rates.
+                its input `n_ticks`; other values are refused in fits. As in model classes, noise
+                with the resolution of the rates (the median of 1 / n_ticks) is then added to
+                `delta_v`. Without it, the density is unbounded if all rates can be fitted
+                perfectly, for example if all are 1. If every measured rate has a tick count,
+                `log_prob` refers to the tick counts, like the log-likelihoods of `fit`; otherwise,
+                it is the log density of the rates.
 
         Raises:
             TrustboError: If the drift or a parameter has the wrong shape.
@@ -141,6 +146,8 @@ class ContactRate(dist.Distribution):
                 n_members=1 if shared is None else n_robots,
             )
         self._set(space, Inputs(u, offset), n_ticks)
+        self.adds_resolution = n_ticks is not None
+        self.noises = delta_w, delta_v
 
     of = OldName("from_space")
 
@@ -153,7 +160,8 @@ class ContactRate(dist.Distribution):
         Args:
             space: Parameters at one point.
             inputs: Drift and offset, each with shape (mission, bound, robot) or ().
-            n_ticks: Number of ticks of each rate; see `ContactRate`.
+            n_ticks: Number of ticks of each rate, to whose counts `log_prob` refers. The noise of
+                `space` must include that of their resolution.
         """
         self = cls.__new__(cls)
         self._set(space, inputs, n_ticks)
@@ -168,7 +176,16 @@ class ContactRate(dist.Distribution):
         self.inputs = Inputs(drift.reshape(grouped), offset.reshape(grouped))
         self.n_ticks = None if n_ticks is None else jnp.broadcast_to(jnp.asarray(n_ticks), shape)
         self.space = space
+        self.adds_resolution = False
+        self.noises: tuple[Any, ...] = ()  # arguments delta_w and delta_v, where they are known
         dist.Distribution.__init__(self, shape[:1], shape[1:])
+
+    @property
+    def form(self) -> StateSpace:
+        """State space of the rates: `space` with the noise of their resolution."""
+        if not self.adds_resolution:
+            return self.space
+        return self.space.with_noise(median_resolution(self.n_ticks))
 
     def log_resolution(self, value: Array) -> Array:
         """Compute the log ratio (mission,) of the probability of tick counts to a density.
@@ -204,15 +221,17 @@ class ContactRate(dist.Distribution):
         rates = jnp.reshape(value, drift.shape)
         by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in (rates, drift, offset))
 
+        space = self.form
+
         def step(belief: kalman.Belief, bound: Any) -> tuple[kalman.Belief, Array]:
             y, u, o = bound
-            predicted = kalman.predict(self.space, belief, Inputs(u, o))
+            predicted = kalman.predict(space, belief, Inputs(u, o))
             no_ticks = y  # any array of this shape
-            return kalman.update(self.space, predicted, y, no_ticks, kalman.GaussianRates())
+            return kalman.update(space, predicted, y, no_ticks, kalman.GaussianRates())
 
         start = jax.tree.map(
             lambda a: jnp.broadcast_to(a.astype(float), (n_missions, *a.shape[1:])),
-            kalman.initial(self.space, n_groups),
+            kalman.initial(space, n_groups),
         )
         return lax.scan(step, start, by_bound)[1].sum(0) + self.log_resolution(value)
 
@@ -221,7 +240,7 @@ class ContactRate(dist.Distribution):
         self, key: Array, sample_shape: tuple[int, ...] = ()
     ) -> Array:
         """Draw contact rates with shape `(*sample_shape, mission, bound, robot)`."""
-        space = self.space
+        space = self.form
         drift, offset = self.inputs
         shape = *sample_shape, *drift.shape
         w, v, s, e = (random.normal(k, shape) for k in random.split(key, 4))

@@ -1,7 +1,7 @@
 """Contact rates and awareness of missions, padded to one array each."""
 
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from trustbo.errors import TrustboError
 from trustbo.models.families import Family
 from trustbo.models.visited import Visited
 from trustbo.stacking import require_same_team
+from trustbo.statespace.matrices import namespace
 
 NO_TICKS = (
     "The beta-binomial family counts ticks. Give the tick count of each bound as n_ticks, for "
@@ -18,7 +19,7 @@ NO_TICKS = (
 UNKNOWN_RESOLUTION = 0.005
 """Resolution assumed for rates with an unknown tick count."""
 COARSEST_RESOLUTION = 0.1
-"""Limit on `Observations.resolution`."""
+"""Limit on `median_resolution`."""
 
 
 class Observations(NamedTuple):
@@ -95,14 +96,9 @@ class Observations(NamedTuple):
 
     @property
     def resolution(self) -> float:
-        """Median resolution 1 / n_ticks of the measured rates, at most `COARSEST_RESOLUTION`."""
-        ticks = np.nan_to_num(self.n_ticks[~np.isnan(self.contact_rate)])
-        if not len(ticks):
-            return UNKNOWN_RESOLUTION
-
-        some = ticks > 0.0
-        steps = np.where(some, 1.0 / np.where(some, ticks, 1.0), UNKNOWN_RESOLUTION)
-        return float(min(np.median(steps), COARSEST_RESOLUTION))
+        """Resolution of the measured rates; see `median_resolution`."""
+        is_measured = ~np.isnan(self.contact_rate)
+        return float(median_resolution(np.where(is_measured, self.n_ticks, 0.0)))
 
     def first(self, n: int) -> Self:
         """Return the first n missions."""
@@ -118,6 +114,23 @@ class Observations(NamedTuple):
         contact_rate = self.contact_rate.copy()
         contact_rate[missions] = np.nan
         return self._replace(contact_rate=contact_rate)
+
+
+def median_resolution(n_ticks: Any) -> Any:
+    """Return the median resolution 1 / n_ticks of rates, in NumPy or JAX.
+
+    Entries that are 0 or NaN, as in the padding, do not count. If there are no others, the result
+    is `UNKNOWN_RESOLUTION`. It is at most `COARSEST_RESOLUTION`.
+    """
+    xp = namespace(n_ticks)
+    is_counted = n_ticks > 0.0
+    steps = xp.where(is_counted, 1.0 / xp.where(is_counted, n_ticks, 1.0), UNKNOWN_RESOLUTION)
+
+    # The median of the counted entries, which come first in this order.
+    steps = xp.sort(xp.where(is_counted, steps, xp.inf), axis=None)
+    n = is_counted.sum()
+    middle = 0.5 * (steps[xp.maximum(n - 1, 0) // 2] + steps[n // 2])
+    return xp.where(n > 0, xp.minimum(middle, COARSEST_RESOLUTION), UNKNOWN_RESOLUTION)
 
 
 def require_ticks(likelihood: Family, contact_rate: np.ndarray, n_ticks: np.ndarray) -> None:

@@ -57,6 +57,10 @@ class StateSpace(NamedTuple):
         xp = namespace(self.noise_sd)
         return xp.sqrt(self.noise_sd**2 + xp.diagonal(self.shared_cov, axis1=-2, axis2=-1))
 
+    def with_noise(self, sd: Any) -> Self:
+        """Return the form with more of each rate's own noise, of standard deviation sd."""
+        return self._replace(noise_sd=namespace(self.noise_sd).hypot(self.noise_sd, sd))
+
     def take(self, index: Any) -> Self:
         """Select points by an index array, a mask or a slice."""
         fields = [None if value is None else value[index] for value in self]

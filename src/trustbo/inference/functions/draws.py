@@ -41,6 +41,7 @@ class FunctionDraws(Draws):
         robots: Names of the robots.
         features: Names of the features.
         shape: Number of rows and columns of the map; None without a map.
+        resolution: Resolution of the rates of the fit, if the function adds it to its noise.
     """
 
     __slots__ = (
@@ -50,6 +51,7 @@ class FunctionDraws(Draws):
         "_of_mean",
         "features",
         "model",
+        "resolution",
         "robots",
         "shape",
         "values",
@@ -62,6 +64,7 @@ class FunctionDraws(Draws):
         robots: Sequence[str],
         features: Sequence[str],
         shape: tuple[int, int] | None,
+        resolution: float = 0.0,
     ) -> None:
         """Store the draws; `values` does not include the variables of single missions."""
         self.model = model
@@ -69,6 +72,7 @@ class FunctionDraws(Draws):
         self.robots = tuple(robots)
         self.features = tuple(features)
         self.shape = shape
+        self.resolution = resolution
         self._numbers = np.arange(len(next(iter(self.values.values()))))  # of the random keys
         self._of_mean = False
         self._is_flat = True  # whether a mean has a leading axis
@@ -134,7 +138,7 @@ class FunctionDraws(Draws):
             if self._of_mean:
                 fields = [None if f is None else f.mean(0, keepdims=True) for f in space]
                 space = StateSpace(*fields)
-            self._form = space
+            self._form = space.with_noise(self.resolution)
         return self._form
 
     def require_valid(self, n_robots: int | None = None, n_features: int | None = None) -> None:

@@ -2,21 +2,17 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
-from trustbo.errors import TrustboError, require_kind, warn
-from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, statistics_of
+from trustbo.errors import TrustboError, require_kind
 from trustbo.inference.draws import in_order_of, joined_draws, names_in
 from trustbo.inference.functions.checks import require_fittable, require_unpadded_results
 from trustbo.inference.functions.data import (
-    RATES,
     Data,
     arrays_of,
     data_of,
@@ -26,20 +22,12 @@ from trustbo.inference.functions.data import (
 )
 from trustbo.inference.functions.draws import N_CHECKED, FunctionDraws
 from trustbo.inference.functions.function import Found, FunctionModel
-from trustbo.inference.functions.nuts import (
-    Sampler,
-    Samples,
-    Start,
-    cold_start,
-    coordinates_of,
-    free_shapes,
-    joined_samples,
-    warm_start,
-)
+from trustbo.inference.functions.nuts import require_gradient
+from trustbo.inference.functions.sampling import Drawn, keys_of, sampled, targets_of
 from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.latent import Latent
 from trustbo.inference.tree import N_PRIOR, add_groups, kept_draws, to_datatree
-from trustbo.models.backend import library_attrs, own_settings
+from trustbo.models.backend import library_attrs
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
 from trustbo.stacking import require_same_robots
@@ -48,32 +36,14 @@ from trustbo.statespace.form import Inputs, StateSpace
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
 
-_WARMUP = 300
-"""Warm-up draws per chain of each run of NUTS, which are discarded."""
-_ACCEPT = 0.95
-"""Target of the acceptance probability."""
-_LAST_ACCEPT = 0.99
-"""Target of the acceptance probability after a divergent transition."""
-_ATTEMPTS = 4
-"""Number of NUTS runs after which bad diagnostics are reported, if each run has many draws."""
-_PATIENT = 2
-"""Number of runs after which the chains of the drift may be checked instead of the variables'."""
-_TOLERATED = 0.005
-"""Fraction of divergent transitions that is accepted from then on, with a warning."""
-_ROUGH_RHAT = 1.1
-"""Largest R-hat of the drift and the noises that the last check accepts, with a warning."""
-_ROUGH_ESS = 50.0
-"""Smallest bulk ESS of the drift and the noises that the last check accepts."""
 _INVENTED = 4
 """Number of bounds of an invented mission, with which a function is checked before missions."""
-_CHECKED = 100
-"""Largest number of measured bounds whose drift is checked."""
-_MOST_ATTEMPTS = 10
-"""Largest number of runs, however short."""
-_MANY = 4000
-"""Total number of draws per chain, over all runs, before bad diagnostics are reported."""
 _OF_PRIOR = 2
 """Offset of the seed of the draws in the groups `prior` and `prior_predictive`."""
+_UNBOUNDED = (
+    "all rates are equal, and ContactRate has no n_ticks, so the density has no limit where the "
+    "noises are 0: pass the input n_ticks to ContactRate(n_ticks=)"
+)
 _SIZE = 200
 """Number of draws for which latent trust is drawn at once."""
 
@@ -82,6 +52,7 @@ def fit_function(
     missions: Sequence[Mission],
     model: FunctionModel,
     workspace: Workspace | None,
+    sampler: str,
     draws: int,
     chains: int,
     warmup: int | None,
@@ -90,9 +61,7 @@ def fit_function(
     check: bool,
     start: xr.DataTree | None,
 ) -> tuple[xr.DataTree, list[str]]:
-    """Fit a function to missions with NUTS; for the arguments, see `trustbo.fit`.
-
-    If the diagnostics are bad and `check` is true, NUTS is run again; see `_sampled`.
+    """Fit a function to missions; for the arguments, see `trustbo.fit`.
 
     Returns:
         The posterior of the parameters, and a list of failed checks.
@@ -100,74 +69,51 @@ def fit_function(
     Raises:
         TrustboError: If the function cannot be a model of these missions.
     """
-    warmup = _WARMUP if warmup is None else warmup
     observations = Observations.from_missions(missions)
     data = _data_for(model, missions, observations)
     sites = model.sites(data)
-    _sampler(model).require_gradient(data, sites)
     if workspace is not None:
         require_plannable(model, workspace)
     require_fittable(model, data, sites, [len(mission.bounds) for mission in missions])
 
-    first = _start(model, sites, data, start, chains, seed)
-    samples, verdict = _sampled(
-        model, data, sites, first, warmup, draws, seed=seed, progress=progress, check=check
+    prior = model.over_draws("prior", 1, data)(keys_of(N_PRIOR, seed + _OF_PRIOR))
+    drawn = sampled(
+        targets_of(model, data, sites),
+        prior,
+        start,
+        sampler,
+        chains=chains,
+        draws=draws,
+        warmup=warmup,
+        seed=seed,
+        progress=progress,
+        check=check,
     )
-    stats = statistics_of(samples.fields)
 
-    n_missions = len(missions)
-    tree = _tree(model, _constrained(model, data, samples), sites, stats, missions, data, seed)
+    resolution = model.resolution(data)
+    if drawn.complaints and not resolution and _all_equal(observations):
+        drawn.complaints.append(_UNBOUNDED)
+    tree = _tree(model, drawn, prior, sites, missions, data)
     tree.attrs |= {
         "model": model.name,
         "model_record": model.text,
         "family": model.family,
         "n_robots": observations.n_robots,
-        "n_missions": n_missions,
+        "n_missions": len(missions),
+        "resolution": resolution,
         "robots": list(missions[0].robots),
         "features": list(missions[0].features),
-        "sampler": "nuts",
         "seed": seed,
-        "step_size": samples.step_size,
-        **verdict.diagnostics,
-        "not_identified": verdict.not_identified,
-        **library_attrs("nuts"),
+        **drawn.attrs,
+        **library_attrs(drawn.attrs["sampler"]),
     }
-
-    if not verdict.complaints:
-        _warn(model, verdict, stats["diverging"].size)
-    return tree, verdict.complaints
+    return tree, drawn.complaints
 
 
-def _warn(model: FunctionModel, verdict: "Verdict", n_transitions: int) -> None:
-    """Warn about diagnostics that were accepted although they exceed the usual limits."""
-    n_diverged = int(verdict.diagnostics["divergences"])
-    r_hat = verdict.diagnostics["r_hat"]
-    ess = verdict.diagnostics["ess_bulk"]
-    is_rough = r_hat > MAX_RHAT or ess < MIN_ESS
-
-    if n_diverged:
-        warn(
-            f"{n_diverged} of {n_transitions} transitions diverged, even with small steps: draws "
-            f"of {model.in_short()} may miss narrow parts of the posterior. Narrower priors or "
-            "another parametrisation help."
-        )
-    if is_rough:
-        warn(
-            f"the posterior of {model.in_short()} is rough: R-hat of its drift and noises is "
-            f"{r_hat:.3f}, bulk ESS {ess:.0f}. More draws and warmup, narrower priors or fewer "
-            "variables help."
-        )
-    if verdict.not_identified:
-        names = joined_names(verdict.not_identified)
-        chains = f"the chains of {names} differ or have too few draws"
-        if is_rough:
-            text = f"{chains}, even under the wider limits of a rough posterior: do not interpret"
-            warn(f"{text} these variables.")
-        else:
-            warn(
-                f"{chains}, but those of the drift and noises agree: plans and predictions can be "
-                "used, these variables cannot."
-            )
+def _all_equal(observations: Observations) -> bool:
+    """Return whether all measured rates are equal."""
+    rates = observations.contact_rate[~np.isnan(observations.contact_rate)]
+    return bool(np.ptp(rates) == 0.0)
 
 
 def with_latent_of_function(
@@ -275,7 +221,7 @@ def _evaluated(
     The random key of a draw does not depend on which other draws are chosen.
     """
     values = _padded_values(posterior, model.sites(data))
-    keys = _keys(len(next(iter(values.values()))), posterior.attrs["seed"])
+    keys = keys_of(len(next(iter(values.values()))), posterior.attrs["seed"])
     evaluate = model.over_draws("evaluate", 2, data)
     for begin in range(0, len(some), _SIZE):
         where = some[begin : begin + _SIZE]
@@ -324,7 +270,8 @@ def draws_of_function(
             f"draws of {bad[0]!r} are NaN; drop these draws with posterior.isel(draw=...) instead "
             "of masking them."
         )
-    return FunctionDraws(model, values, robots, features, shape)
+    resolution = float(posterior.attrs["resolution"])
+    return FunctionDraws(model, values, robots, features, shape, resolution)
 
 
 def prior_draws_of_function(
@@ -337,7 +284,7 @@ def prior_draws_of_function(
     data = _nothing(model, n_robots, features)
     sites = model.sites(data)
 
-    drawn = model.over_draws("prior", 1, data)(_keys(n_draws, seed))
+    drawn = model.over_draws("prior", 1, data)(keys_of(n_draws, seed))
     values = {name: drawn[name] for name, site in sites.items() if site.mission_axis is None}
     if not values:
         raise TrustboError(f"{model.in_short()} has no variable that is common to all missions.")
@@ -350,10 +297,11 @@ def require_plannable(model: FunctionModel, workspace: Workspace) -> None:
     draws.require_plannable(workspace.awareness.values)
 
 
-def require_learnable(model: FunctionModel, workspace: Workspace) -> None:
+def require_learnable(model: FunctionModel, workspace: Workspace, *, by_gradient: bool) -> None:
     """Raise TrustboError if a function cannot be fitted to any mission of a workspace.
 
-    Before there are missions, the checks of `fit_function` are run on an invented mission.
+    Before there are missions, the checks of `fit_function` are run on an invented mission. With
+    `by_gradient`, the density must have a gradient.
     """
     awareness = workspace.awareness.values
     z = np.moveaxis(awareness, 0, -2)  # (move, row, col, robot, feature)
@@ -362,7 +310,8 @@ def require_learnable(model: FunctionModel, workspace: Workspace) -> None:
     if model.needs_observations:
         data["observations"] = observations_of(data)
     sites = model.sites(data)
-    _sampler(model).require_gradient(data, sites)
+    if by_gradient:
+        require_gradient(model, targets_of(model, data, sites)[0].coordinates, data)
     if not model.needs_observations:  # its data are not padded
         require_unpadded_results(model, data, sites, [len(known)])
 
@@ -403,195 +352,6 @@ def _nothing(model: FunctionModel, n_robots: int, features: tuple[str, ...]) -> 
     if model.needs_observations:
         data["observations"] = observations_of(data)
     return data
-
-
-def _sampler(model: FunctionModel) -> Sampler:
-    """Return the sampler of a function, which keeps earlier compilations."""
-    if model.sampler is None:
-        model.sampler = Sampler(model)
-    return model.sampler
-
-
-class Verdict(NamedTuple):
-    """Diagnostics of samples."""
-
-    diagnostics: dict[str, float]
-    complaints: list[str]
-    """Failed checks."""
-    not_identified: list[str]
-    """Variables whose chains differ although the chains of the drift and the noises agree."""
-
-
-def _judge(
-    model: FunctionModel, data: Data, samples: Samples, *, patient: bool, last: bool = False
-) -> Verdict:
-    """Check the chains of the variables or, if `patient`, of the quantities that plans depend on.
-
-    Variables may differ between chains although the drift does not. An example is the weights of a
-    neural network, whose units can be exchanged. Therefore, if `patient` is true and the chains of
-    the variables are bad, those of the drift and the noises are checked instead. With `patient`, a
-    few divergences are also accepted. In the `last` check, the limits for the drift and the noises
-    are wider, because plans from a rough posterior are better than plans that ignore a mission.
-    """
-    diverging = samples.fields["diverging"]
-    most = int(_TOLERATED * diverging.size) if patient else 0
-    found, complaints = complaints_of(samples.z, diverging, max_divergences=most)
-    if not complaints or not patient:
-        return Verdict(found, complaints, [])
-
-    used = _used_by_plans(model, data, samples)
-    limits: dict[str, Any] = {"max_divergences": most}
-    if last:
-        limits |= {"max_rhat": _ROUGH_RHAT, "min_ess": _ROUGH_ESS}
-    found, complaints = complaints_of(used, diverging, **limits)
-    if complaints:
-        return Verdict(found, complaints, [])
-
-    # A variable that is itself a noise has the same chains, so the same limits apply to it.
-    values = _constrained(model, data, samples)
-    shape = diverging.shape
-    alone = {
-        name: complaints_of({name: v.reshape(*shape, -1)}, diverging, **limits)[1]
-        for name, v in values.items()
-    }
-    return Verdict(found, [], [name for name, failed in alone.items() if failed])
-
-
-def _constrained(model: FunctionModel, data: Data, samples: Samples) -> dict[str, np.ndarray]:
-    """Return the values (draw, ...) of the variables, with chains joined."""
-    flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in samples.z.items()}
-    return model.over_draws("constrain", 1, data)(flat)
-
-
-def _used_by_plans(model: FunctionModel, data: Data, samples: Samples) -> dict[str, np.ndarray]:
-    """Return the drift in some measured bounds and the form, of shape (chain, draw, number)."""
-    shape = samples.fields["diverging"].shape
-    n_draws = shape[0] * shape[1]
-    values = _constrained(model, data, samples)
-    space, inputs = model.over_draws("form", 2, data)(values, _keys(n_draws, 0))
-
-    measured = np.flatnonzero(~np.isnan(data[RATES].ravel()))
-    some = measured[np.linspace(0, len(measured) - 1, min(_CHECKED, len(measured))).astype(int)]
-    drift = (inputs.drift + inputs.offset).reshape(n_draws, -1)[:, some]
-
-    used = {"drift": drift}
-    for name, value in space._asdict().items():
-        if value is None:
-            continue
-        # A variance is checked as the sd that the user gave, because their R-hats differ.
-        is_variance = name.endswith("_cov") and value.shape[-1] == 1
-        used[name] = np.sqrt(value) if is_variance else value
-    return {name: v.reshape(*shape, -1) for name, v in used.items()}
-
-
-def _sampled(
-    model: FunctionModel,
-    data: Data,
-    sites: Mapping[str, Site],
-    start: Start,
-    warmup: int,
-    draws: int,
-    *,
-    seed: int,
-    progress: bool,
-    check: bool,
-) -> tuple[Samples, Verdict]:
-    """Run NUTS until the diagnostics are good or many draws have been taken.
-
-    Each run starts from draws of the run before, and the draws of all runs are joined. The
-    requested number of draws is kept, evenly spaced, or all draws if the checks need more. If a
-    transition of the first run or more than 0.5 % of those of a later run diverge, all draws so far
-    are discarded, and steps are smaller. From the second run on, a few divergences and variables
-    that are not identified are accepted; see `_judge`.
-
-    Returns:
-        Samples, and the verdict on them.
-    """
-    sampler = _sampler(model)
-    accept = _ACCEPT
-    n_diverged = 0
-    runs: list[Samples] = []
-    most = min(max(_ATTEMPTS, _MANY // draws), _MOST_ATTEMPTS) if check else 1
-    attempt = 0
-    while True:
-        title = f"NUTS, run {attempt + 1}"
-        if most > 1:
-            title += f" of at most {most}"
-        if n_diverged:
-            title += f" ({n_diverged} divergences in the last run)"
-        last = sampler.sample(
-            data,
-            sites,
-            start,
-            warmup,
-            draws,
-            accept=accept,
-            seed=int(np.random.SeedSequence([seed, attempt]).generate_state(1)[0]),
-            progress=progress,
-            title=title,
-        )
-        attempt += 1
-        patient = attempt >= _PATIENT
-        n_diverged = int(last.fields["diverging"].sum())
-        share = last.fields["diverging"].mean()
-        is_bad = share > (_TOLERATED if patient else 0.0)
-        if is_bad:
-            runs = []
-            accept = _LAST_ACCEPT
-
-        joined = joined_samples([*runs, last])
-        is_last = attempt == most
-        verdict = _judge(model, data, joined, patient=patient, last=is_last)
-        if not verdict.complaints or is_last:
-            if not runs:  # one run has the requested number of draws
-                return joined, verdict
-            few = joined.some(draws)
-            of_few = _judge(model, data, few, patient=patient)
-            return (joined, verdict) if of_few.complaints else (few, of_few)
-
-        if not is_bad:
-            runs.append(last)
-        x = coordinates_of(last.z)
-        start = warm_start(x, last.step_size, len(start.x), seed + attempt)
-
-
-def _start(
-    model: FunctionModel,
-    sites: Mapping[str, Site],
-    data: Data,
-    previous: xr.DataTree | None,
-    chains: int,
-    seed: int,
-) -> Start:
-    """Return the starts of the chains, which are draws of a previous posterior of the function.
-
-    If the previous posterior has other variables, or a variable has an axis of missions, the starts
-    are random.
-    """
-    with own_settings():
-        free = free_shapes(model, sites, data)
-    n = sum(values.size for values in free.values())
-    if previous is None or previous.attrs["model_record"] != model.text:
-        return cold_start(n, chains, seed)
-
-    draws = previous["posterior"].to_dataset()
-    values = {name: joined_draws(draws[safe(name)]) for name in sites if safe(name) in draws}
-    for name, site in sites.items():
-        is_same = name in values and values[name].shape[1:] == site.shape
-        if site.mission_axis is not None or not is_same:
-            return cold_start(n, chains, seed)
-
-    z = model.over_draws("unconstrain", 1, data)(values)
-    x = coordinates_of({name: array[None] for name, array in z.items()})
-    if not np.isfinite(x).all():
-        return cold_start(n, chains, seed)
-    return warm_start(x, previous.attrs["step_size"], chains, seed)
-
-
-def _keys(n: int, seed: int) -> Any:
-    """Return n random keys."""
-    with own_settings():
-        return jax.random.split(jax.random.key(seed), n)
 
 
 def _without_padding(values: np.ndarray, site: Site, n_missions: int) -> np.ndarray:
@@ -663,7 +423,7 @@ def _prior_predictive(
     model: FunctionModel, data: Data, observations: Observations, seed: int
 ) -> np.ndarray:
     """Draw rates (draw, mission, bound, robot) of the missions from the prior."""
-    keys = _keys(N_PRIOR, seed + _OF_PRIOR)
+    keys = keys_of(N_PRIOR, seed + _OF_PRIOR)
     values = model.over_draws("prior", 1, data)(keys)
     found: Found = model.over_draws("evaluate", 2, data)(values, keys)
     n_missions, n_bounds = observations.contact_rate.shape[:2]
@@ -674,20 +434,18 @@ def _prior_predictive(
 
 def _tree(
     model: FunctionModel,
-    values: Mapping[str, np.ndarray],
+    drawn: Drawn,
+    prior: Mapping[str, np.ndarray],
     sites: Mapping[str, Site],
-    stats: Mapping[str, np.ndarray],
     missions: Sequence[Mission],
     data: Data,
-    seed: int,
 ) -> xr.DataTree:
-    """Build a DataTree from draws (draw, ...) of the variables, statistics (chain, draw) and data.
+    """Build a DataTree from draws of the posterior, draws (draw, ...) of the prior, and data.
 
     The groups `posterior` and `prior` include sites of `numpyro.deterministic`.
     """
     computed = model.computed_sites(data)
     stored = {**sites, **computed}
-    prior = model.over_draws("prior", 1, data)(_keys(N_PRIOR, seed + _OF_PRIOR))
 
     def by_chain(values: Mapping[str, np.ndarray], shape: tuple[int, ...]) -> dict[str, Any]:
         whole = {**values, **_computed(model, values, computed, data)}
@@ -698,8 +456,8 @@ def _tree(
         }
 
     groups = {
-        "posterior": by_chain(values, stats["lp"].shape),
-        "sample_stats": dict(stats),
+        "posterior": by_chain(drawn.values, drawn.statistics["lp"].shape),
+        "sample_stats": drawn.statistics,
         "prior": by_chain(prior, (1, N_PRIOR)),
     }
     shapes = {name: groups["posterior"][safe(name)].shape[2:] for name in stored}
@@ -724,7 +482,7 @@ def _computed(
         return {}
 
     n_draws = len(next(iter(values.values())))
-    keys = _keys(n_draws, 0)
+    keys = keys_of(n_draws, 0)
     compute = model.over_draws("deterministic", 2, data)
     parts = []
     for begin in range(0, n_draws, _SIZE):  # sites that are left out may be large

@@ -3,7 +3,7 @@
 import inspect
 import json
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -16,10 +16,12 @@ from numpyro.distributions import (
     ExpandedDistribution,
     Independent,
     MaskedDistribution,
+    Normal,
     TransformedDistribution,
     biject_to,
 )
 from numpyro.distributions.distribution import Unit
+from numpyro.distributions.transforms import AffineTransform, ExpTransform
 from numpyro.infer.util import log_density
 from numpyro.primitives import Messenger, sample
 
@@ -42,6 +44,8 @@ from trustbo.inference.functions.sites import (
 )
 from trustbo.models.backend import own_settings
 from trustbo.models.contact_rate import ContactRate
+from trustbo.models.observations import median_resolution
+from trustbo.models.scores import NOISES
 from trustbo.statespace import Inputs, StateSpace
 
 KIND = "function"
@@ -96,8 +100,7 @@ class FunctionModel:
     Attributes:
         function: The function.
         inputs: Names of the inputs that it takes; see `data.NAMES`.
-        compiled: Methods that were compiled for draws, by name and features.
-        sampler: `nuts.Sampler` of the function, or None if there is none yet.
+        compiled: Functions that were compiled for draws; see `compiled_over_draws`.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -111,8 +114,7 @@ class FunctionModel:
         self.name = name_of(function)
         self.inputs = _inputs_of(function, self.name)
         self.fingerprint = fingerprint(function)
-        self.compiled: dict[tuple[str, tuple[str, ...]], Callable[..., Any]] = {}
-        self.sampler: Any = None
+        self.compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}
         self._in_range: set[tuple[str, ...]] = set()  # feature names that were checked
         self._runs_again = False  # whether a check has found all sites in a second run
 
@@ -130,7 +132,7 @@ class FunctionModel:
         return f"FunctionModel({self.in_short()})"
 
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"compiled": {}, "sampler": None}  # compiled code cannot be pickled
+        return vars(self) | {"compiled": {}}  # compiled code cannot be pickled
 
     def in_short(self) -> str:
         """Return the name of the function."""
@@ -170,6 +172,37 @@ class FunctionModel:
         plates = plates_of_rates(trace)
         with explained(self.in_short(), data):
             return {name: site_of(trace[name], free[name], plates) for name in free}
+
+    def free(self, data: Data) -> dict[str, np.ndarray]:
+        """Return zeros of the shape of each latent variable in unconstrained space, by name."""
+        _, free = self._shapes(data)
+        return {name: np.zeros(np.shape(free[name])) for name in sorted(free)}
+
+    def noises(self, data: Data) -> tuple[str, str] | None:
+        """Return the names of the variables that are delta_w and delta_v themselves, if they are.
+
+        Both must be positive and have the same shape, without an axis of missions.
+        """
+        trace, free = self._shapes(data)
+        names = []
+        for noise in trace[RATES]["fn"].noises:
+            names += [name for name in free if trace[name]["value"] is noise]
+        if len(names) < len(NOISES) or np.shape(free[names[0]]) != np.shape(free[names[1]]):
+            return None
+
+        sites = [site_of(trace[name], free[name], plates_of_rates(trace)) for name in names]
+        maps = [biject_to(trace[name]["fn"].support) for name in names]
+        is_plain = all(site.mission_axis is None for site in sites)
+        is_plain = is_plain and all(isinstance(one, ExpTransform) for one in maps)
+        return (names[0], names[1]) if is_plain else None
+
+    def resolution(self, data: Data) -> float:
+        """Return the resolution of rates that the function adds to its noise, or 0."""
+        trace, _ = self._shapes(data)
+        if not trace[RATES]["fn"].adds_resolution:
+            return 0.0
+        is_measured = ~np.isnan(data[RATES])
+        return float(median_resolution(np.where(is_measured, data["n_ticks"], 0.0)))
 
     def computed_sites(self, data: Data) -> dict[str, Site]:
         """Return the sites of `numpyro.deterministic` by name, except those with an axis of bounds.
@@ -394,17 +427,19 @@ class FunctionModel:
 
     # --- functions that are compiled once for each shape of their arguments ---
 
-    def potential(self, z: Mapping[str, Any], data: Data) -> Any:
-        """Compute the negative log density at unconstrained values z."""
-        log_p, _ = log_density(self._at(z), (data,), {}, {})
+    def potential(self, z: Mapping[str, Any], data: Data, deviations: Collection[str] = ()) -> Any:
+        """Compute the negative log density at unconstrained values z; see `_transform_of`."""
+        log_p, _ = log_density(self._at(z, deviations), (data,), {}, {})
         return -log_p
 
-    def constrain(self, z: Mapping[str, Any], data: Data) -> dict[str, Any]:
-        """Convert unconstrained values to values of the variables."""
-        trace = handlers.trace(self._at(z)).get_trace(data)
+    def constrain(
+        self, z: Mapping[str, Any], data: Data, deviations: Collection[str] = ()
+    ) -> dict[str, Any]:
+        """Convert unconstrained values to values of the variables; see `_transform_of`."""
+        trace = handlers.trace(self._at(z, deviations)).get_trace(data)
         return {name: trace[name]["value"] for name in z}
 
-    def _at(self, z: Mapping[str, Any]) -> Callable[..., Any]:
+    def _at(self, z: Mapping[str, Any], deviations: Collection[str]) -> Callable[..., Any]:
         """Return the function with unconstrained values z, and with a factor for each Jacobian.
 
         `numpyro.infer.util.potential_energy` does the same with `numpyro.factor`, which fails after
@@ -416,7 +451,7 @@ class FunctionModel:
             if site["type"] != "sample" or name not in z:
                 return None
 
-            transform = biject_to(site["fn"].support)
+            transform = _transform_of(site, deviations)
             x = z[name]
             n_more = transform.codomain.event_dim - transform.domain.event_dim
             step = site["infer"].get("_scan_current_index")  # within numpyro.contrib's scan
@@ -434,14 +469,26 @@ class FunctionModel:
 
         return handlers.substitute(handlers.seed(self.call, 0), substitute_fn=value_of)
 
-    def unconstrain(self, values: Mapping[str, Any], data: Data) -> dict[str, Any]:
-        """Convert values of the variables to unconstrained values."""
+    def unconstrain(
+        self, values: Mapping[str, Any], data: Data, deviations: Collection[str] = ()
+    ) -> dict[str, Any]:
+        """Convert values of the variables to unconstrained values; see `_transform_of`."""
         trace = self._trace(values, jax.random.key(0), data)
-        return {name: biject_to(trace[name]["fn"].support).inv(v) for name, v in values.items()}
+        return {name: _transform_of(trace[name], deviations).inv(v) for name, v in values.items()}
+
+    def scales(self, key: jax.Array, data: Data) -> dict[str, Any]:
+        """Return the means and standard deviations of normal variables, for a draw of the prior."""
+        trace = self._trace({}, key, data)
+        bases = {name: _base_of(trace[name]["fn"]) for name in latent_in(trace)}
+        return {name: (b.loc, b.scale) for name, b in bases.items() if isinstance(b, Normal)}
 
     def prior(self, key: jax.Array, data: Data) -> dict[str, Any]:
         """Draw the variables from the prior."""
-        trace = self._trace({}, key, data)
+        return self.prior_given({}, key, data)
+
+    def prior_given(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> dict[str, Any]:
+        """Draw the variables from the prior given the values of some of them."""
+        trace = self._trace(values, key, data)
         return {name: trace[name]["value"] for name in latent_in(trace)}
 
     def deterministic(
@@ -456,7 +503,7 @@ class FunctionModel:
         trace = self._trace(values, key, data)
         rates: Any = trace[RATES]["fn"]
         return Found(
-            space=rates.space,
+            space=rates.form,
             inputs=rates.inputs,
             log_prior={
                 name: trace[name]["fn"].log_prob(trace[name]["value"]) for name in latent_in(trace)
@@ -476,7 +523,7 @@ class FunctionModel:
 
         rates: Any = trace[RATES]["fn"]
         return Probe(
-            space=rates.space,
+            space=rates.form,
             inputs=rates.inputs,
             rates=trace[RATES]["value"],
             n_ticks=rates.n_ticks,
@@ -488,7 +535,7 @@ class FunctionModel:
     def form(
         self, values: Mapping[str, Any], key: jax.Array, data: Data
     ) -> tuple[StateSpace, Inputs]:
-        """Return the state space and the inputs for given values of the variables."""
+        """Return the state space, without noise of the resolution, and the inputs."""
         rates: Any = self._trace(values, key, data)[RATES]["fn"]
         return rates.space, rates.inputs
 
@@ -505,14 +552,26 @@ class FunctionModel:
             n_draw_axes: Number of arguments with an axis (draw,).
             data: Inputs.
         """
+        return self.compiled_over_draws((method,), getattr(self, method), n_draw_axes, data)
+
+    def compiled_over_draws(
+        self, key: tuple[Any, ...], compute: Callable[..., Any], n_draw_axes: int, data: Data
+    ) -> Callable[..., Any]:
+        """Return a function of draws and data, compiled for these data; see `over_draws`.
+
+        Args:
+            key: What tells the function from others; it is compiled once for each key.
+            compute: Function whose last argument is `data`.
+            n_draw_axes: Number of arguments with an axis (draw,).
+            data: Inputs.
+        """
         axes = (*(0,) * n_draw_axes, None)
-        compute = getattr(self, method)
         if self.needs_observations:
             mapped = jax.jit(jax.vmap(lambda *draws: compute(*draws, data)))
             return lambda *draws: self._called(mapped, draws, data)
 
         features = data["features"]
-        known = method, features
+        known = *key, features
         if known not in self.compiled:
 
             def of_arrays(*arguments: Any) -> Any:
@@ -529,6 +588,18 @@ class FunctionModel:
         """Call a compiled function with the settings and error messages of this module."""
         with own_settings(), explained(self.in_short(), data):
             return jax.tree.map(np.asarray, compiled(*arguments))
+
+
+def _transform_of(site: Mapping[str, Any], deviations: Collection[str]) -> Any:
+    """Return the transform from unconstrained values to values of a variable.
+
+    The values of `deviations` are those of normal variables, from their means and in units of their
+    standard deviations.
+    """
+    if site["name"] in deviations:
+        base = _base_of(site["fn"])
+        return AffineTransform(base.loc, base.scale)
+    return biject_to(site["fn"].support)
 
 
 _KNOWN: OrderedDict[str, FunctionModel] = OrderedDict()

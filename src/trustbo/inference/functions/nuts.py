@@ -1,27 +1,27 @@
-"""Sampling of a NumPyro function with NUTS, compiled once for each shape of data.
+"""Sampling of a NumPyro function with NUTS: one run of each chain, which can be continued.
 
 The data, the starts of the chains, the step size and the mass matrix are arguments of the compiled
-function. A campaign, which fits after each mission, therefore compiles it again only when the
-padded data grow. Chains start from draws of the previous posterior, if there is one.
+functions. A campaign, which fits after each mission, therefore compiles them again only when the
+padded data grow.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.flatten_util import ravel_pytree
 from numpyro.infer.hmc import hmc
 
-from trustbo.display import announced, refreshing, slow_bar
+from trustbo.display import announced, slow_bar
 from trustbo.errors import TrustboError
 from trustbo.inference.diagnostics import FIELDS
-from trustbo.inference.functions.data import Data, arrays_of
-from trustbo.inference.functions.explain import explained, reason_of
+from trustbo.inference.functions.coordinates import Coordinates
+from trustbo.inference.functions.data import Data
+from trustbo.inference.functions.explain import reason_of
 from trustbo.inference.functions.function import FunctionModel
-from trustbo.inference.functions.sites import Site
 from trustbo.models.backend import own_settings
 
 _CANDIDATES = 16
@@ -29,13 +29,15 @@ _CANDIDATES = 16
 _RADIUS = 2.0
 """Candidates are uniform in (-2, 2) in unconstrained space, as in Stan and NumPyro."""
 _FIRST_STEP = 0.1
-"""Initial step size of the warm-up if there is no previous posterior."""
+"""Initial step size of the warm-up."""
 _MOST_DENSE = 50
 """Largest number of coordinates for which the mass matrix is dense."""
 _RIDGE = 1e-3
-"""Fraction of the variances that is added to the covariance of a previous posterior."""
+"""Fraction of the variances that is added to the covariance of a start."""
 _DEPTH = 7
 """Largest number of doublings of a trajectory, which then has 127 steps."""
+_PART = 100
+"""Number of draws that are compiled as one loop, after which progress is shown."""
 
 
 class Start(NamedTuple):
@@ -43,242 +45,207 @@ class Start(NamedTuple):
 
     x: np.ndarray
     """Candidates, shape (chain, candidate, coordinate)."""
-    step_size: float
     inverse_mass: np.ndarray
     """Inverse mass matrix (coordinate, coordinate), or its diagonal (coordinate,)."""
 
+    @classmethod
+    def cold(cls, n: int, chains: int, seed: int) -> "Start":
+        """Return a start without draws, for n coordinates."""
+        rng = np.random.default_rng([seed, 1])
+        x = rng.uniform(-_RADIUS, _RADIUS, (chains, _CANDIDATES, n))
+        return cls(x, np.eye(n) if n <= _MOST_DENSE else np.ones(n))
+
+    @classmethod
+    def near(cls, x: np.ndarray, chains: int, seed: int) -> "Start":
+        """Return a start from draws x (draw, coordinate) of a similar distribution."""
+        rng = np.random.default_rng([seed, 1])
+        chosen = x[rng.integers(len(x), size=(chains, _CANDIDATES))]
+
+        variance = x.var(0)
+        mass = variance
+        if x.shape[1] <= _MOST_DENSE:
+            mass = np.cov(x.T).reshape(x.shape[1], -1) + _RIDGE * np.diag(variance)
+        return cls(chosen, mass)
+
 
 class Samples(NamedTuple):
-    """Draws of a chain in unconstrained space, and statistics of the sampler."""
+    """Draws of chains, and statistics of the sampler."""
 
-    z: dict[str, np.ndarray]
-    """Values (chain, draw, ...) of the variables in unconstrained space."""
+    x: np.ndarray
+    """Coordinates, shape (chain, draw, coordinate)."""
     fields: dict[str, np.ndarray]
     """Statistics (chain, draw) by NumPyro's names."""
-    step_size: float
-    """Mean step size after warm-up."""
 
     def some(self, draws: int) -> "Samples":
         """Return `draws` evenly spaced draws of each chain."""
-        n = self.fields["diverging"].shape[1]
+        n = self.x.shape[1]
         kept = np.linspace(0, n - 1, min(draws, n)).astype(int)
-        return Samples(
-            {name: values[:, kept] for name, values in self.z.items()},
-            {name: values[:, kept] for name, values in self.fields.items()},
-            self.step_size,
-        )
-
-
-class Sampler:
-    """NUTS for a function, compiled for each number of draws and each shape of data."""
-
-    def __init__(self, model: FunctionModel) -> None:
-        self.model = model
-        self._compiled: dict[Any, Callable[..., Any]] = {}
-        self._has_gradient = False  # whether it was checked
+        fields = {name: values[:, kept] for name, values in self.fields.items()}
+        return Samples(self.x[:, kept], fields)
 
     @property
-    def n_compiled(self) -> int:
-        """Number of compilations so far."""
-        return sum(run._cache_size() for run in self._compiled.values())  # pyright: ignore[reportFunctionMemberAccess]
+    def points(self) -> np.ndarray:
+        """Coordinates of all chains, shape (draw, coordinate)."""
+        return self.x.reshape(-1, self.x.shape[2])
 
-    def require_gradient(self, data: Data, sites: Mapping[str, Site]) -> None:
-        """Raise TrustboError if JAX cannot differentiate the density of the function.
 
-        The gradient is traced, once for each function, without computing anything.
-        """
-        if self._has_gradient:
-            return
+class Chains:
+    """Chains of NUTS for a function and its data.
 
-        def slope(z: dict[str, Any], arrays: Data) -> Any:
-            return jax.grad(self.model.potential)(z, self._inputs(data, arrays))
+    Args:
+        model: The function.
+        coordinates: Its coordinates for these data.
+        data: Inputs.
+        warmup: Number of draws per chain that tune the kernel and are discarded.
+        accept: Target of the acceptance probability.
+        seed: Random seed.
+        progress: Whether to show a progress bar, after 2 seconds.
+    """
 
-        try:
-            with own_settings():
-                jax.eval_shape(slope, free_shapes(self.model, sites, data), self._arrays(data))
-        except TrustboError:
-            raise
-        except Exception as error:
-            reason = reason_of(error).rstrip(".")
-            raise TrustboError(
-                f"{self.model.in_short()} has no gradient, which NUTS needs: {reason}. Use "
-                "jax.lax.scan for loops, or jax.lax.fori_loop with constant bounds, and define the "
-                "gradient of callbacks with jax.custom_jvp or jax.custom_vjp."
-            ) from error
-        self._has_gradient = True
-
-    def _arrays(self, data: Data) -> dict[str, Any]:
-        """Return the inputs that are arguments of compiled functions."""
-        if self.model.needs_observations:
-            return {}
-        given = arrays_of(data)
-        return {n: jnp.asarray(v) for n, v in given.items() if n in self.model.inputs}
-
-    def _inputs(self, data: Data, arrays: Data) -> Data:
-        """Return all inputs, given those that are arguments of a compiled function."""
-        return data if self.model.needs_observations else {**arrays, "features": data["features"]}
-
-    def sample(
+    def __init__(
         self,
+        model: FunctionModel,
+        coordinates: Coordinates,
         data: Data,
-        sites: Mapping[str, Site],
-        start: Start,
-        warmup: int,
-        draws: int,
         *,
+        warmup: int,
         accept: float,
         seed: int,
         progress: bool,
-        title: str = "NUTS",
-    ) -> Samples:
-        """Sample from the posterior.
+    ) -> None:
+        self.model = model
+        self.coordinates = coordinates
+        self.data = data
+        self.warmup = warmup
+        self.accept = accept
+        self.seed = seed
+        self.progress = progress
+        self._state: Any = None
 
-        Args:
-            data: Padded data.
-            sites: Variables of the function for these data.
-            start: Starts of the chains, initial step size and mass matrix.
-            warmup: Number of draws per chain that tune the kernel and are discarded.
-            draws: Number of draws per chain.
-            accept: Target of the acceptance probability.
-            seed: Random seed.
-            progress: Whether to show the elapsed seconds, after 2 seconds.
-            title: Text to show before the elapsed seconds.
+    def run(self, start: Start, draws: int) -> Samples:
+        """Start the chains; return the draws after the warm-up.
 
         Raises:
-            TrustboError: If no candidate has a finite density.
+            TrustboError: If no candidate has a finite density, or a gradient is not finite.
         """
-        with (
-            own_settings(),
-            announced("Compiling the model and sampling (about 30 s at first use)."),
-            slow_bar(title, " s", progress) as bar,
-            refreshing(bar, step=1),
-        ):
-            free = free_shapes(self.model, sites, data)
-            unravel = ravel_pytree(free)[1]
-            run = self._run_of(free, unravel, warmup, draws, data)
+        n_chains = len(start.x)
+        mass = np.broadcast_to(start.inverse_mass, (n_chains, *start.inverse_mass.shape))
+        with own_settings(), announced("Compiling the model for NUTS (about 20 s at first use)."):
+            keys = jax.random.key_data(jax.random.split(jax.random.key(self.seed), n_chains))
+            begin = self._compiled("begin", self._begin, 3)
+            self._state, has_density, has_slope = begin(np.asarray(keys), start.x, mass)
 
-            arrays = self._arrays(data)
-            keys = jax.random.split(jax.random.key(seed), len(start.x))
-            with explained(self.model.in_short(), data):
-                found = run(keys, start.x, start.step_size, start.inverse_mass, accept, arrays)
-                x, fields, step_size, has_slope = jax.tree.map(np.asarray, found)
-            z = jax.tree.map(np.asarray, jax.vmap(jax.vmap(unravel))(x))
-
-        if not np.isfinite(fields["potential_energy"]).all():
+        if not np.all(has_density):
             raise TrustboError(
                 f"{self.model.in_short()} has no finite density at the starts of the chains. Check "
                 "that delta_w and delta_v are positive and that the drift is finite, also where an "
                 "input such as duration or n_ticks is NaN (jnp.nan_to_num)."
             )
-        if not has_slope.all():
+        if not np.all(has_slope):
             raise TrustboError(
                 f"{self.model.in_short()} has a gradient that is not finite at the starts of the "
                 "chains; check square roots, norms and powers of 0 and inverses of singular "
                 "matrices, also in branches of jnp.where that are not used."
             )
-        return Samples(z, fields, float(step_size.mean()))
+        self._advance(self.warmup, "NUTS, warm-up")
+        return self.proceed(draws)
 
-    def _run_of(
-        self,
-        free: Mapping[str, Any],
-        unravel: Callable[..., Any],
-        warmup: int,
-        draws: int,
-        data: Data,
+    def proceed(self, draws: int) -> Samples:
+        """Continue the chains; return the next draws."""
+        return self._advance(draws, "NUTS")
+
+    def _advance(self, draws: int, title: str) -> Samples:
+        """Take draws in parts."""
+        parts = []
+        sizes = [_PART] * (draws // _PART) + [draws % _PART] * (draws % _PART > 0)
+        with slow_bar(title, " draws", self.progress, total=draws) as bar:
+            for n in sizes:
+                advance = self._compiled(f"advance by {n}", partial(self._advanced, n=n), 1)
+                self._state, x, fields = advance(self._state)
+                parts.append(Samples(x, fields))
+                bar.update(n)
+        return joined_samples(parts)
+
+    def _compiled(
+        self, name: str, compute: Callable[..., Any], n_chain_axes: int
     ) -> Callable[..., Any]:
-        """Return the compiled function that runs the chains."""
-        shapes = tuple((name, np.shape(values)) for name, values in free.items())
-        fixed = id(data["observations"]) if self.model.needs_observations else None
-        features = data["features"]
-        known = (shapes, warmup, draws, features, fixed)
-        if known in self._compiled:
-            return self._compiled[known]
+        """Return a function of states of chains, compiled for these data."""
+        key = (name, self.coordinates.key, self.warmup, self.accept)
+        return self.model.compiled_over_draws(key, compute, n_chain_axes, self.data)
 
-        n = sum(int(np.prod(shape)) for _, shape in shapes)
+    def _kernel(self, x: Any, mass: Any, key: Any, data: Data) -> tuple[Any, Callable[..., Any]]:
+        """Return the state of a chain at x, and the function that moves a state."""
+        begin, move = hmc(
+            potential_fn=lambda x: -log_density_of(self.model, self.coordinates, x, data),
+            algo="NUTS",
+        )
+        state = begin(
+            x,
+            num_warmup=self.warmup,
+            step_size=_FIRST_STEP,
+            inverse_mass_matrix=mass,
+            dense_mass=self.coordinates.n <= _MOST_DENSE,
+            target_accept_prob=self.accept,
+            max_tree_depth=_DEPTH,
+            rng_key=key,
+        )
+        return state, move
 
-        def potential_of(arrays: Data) -> Callable[[Any], Any]:
-            given = self._inputs(data, arrays)
-            return lambda x: self.model.potential(unravel(x), given)
+    def _begin(self, key: Any, candidates: Any, mass: Any, data: Data) -> tuple[Any, Any, Any]:
+        """Start a chain at the candidate with the largest density."""
+        density = lax.map(
+            lambda x: log_density_of(self.model, self.coordinates, x, data), candidates
+        )
+        chosen = jnp.argmax(jnp.where(jnp.isfinite(density), density, -jnp.inf))
+        state, _ = self._kernel(candidates[chosen], mass, key, data)
+        return state, jnp.isfinite(density[chosen]), jnp.isfinite(state.z_grad).all()
 
-        def chain(
-            key: Any, candidates: Any, step_size: Any, mass: Any, accept: Any, arrays: Any
-        ) -> Any:
-            density = lax.map(potential_of(arrays), candidates)
-            chosen = jnp.argmin(jnp.where(jnp.isfinite(density), density, jnp.inf))
+    def _advanced(self, state: Any, data: Data, *, n: int) -> tuple[Any, Any, Any]:
+        """Take n draws of a chain; return its state, coordinates and statistics."""
+        # NumPyro's kernel is made with its first state, which is not computed if it is not used.
+        mass = jnp.eye(self.coordinates.n)
+        if self.coordinates.n > _MOST_DENSE:
+            mass = jnp.ones(self.coordinates.n)
+        _, move = self._kernel(state.z, mass, state.rng_key, data)
 
-            begin, move = hmc(potential_fn_gen=potential_of, algo="NUTS")
-            state = begin(
-                candidates[chosen],
-                num_warmup=warmup,
-                step_size=step_size,
-                inverse_mass_matrix=mass,
-                dense_mass=n <= _MOST_DENSE,
-                target_accept_prob=accept,
-                max_tree_depth=_DEPTH,
-                model_args=(arrays,),
-                rng_key=key,
-            )
-            has_slope = jnp.isfinite(state.z_grad).all()
+        def one(state: Any, _: None) -> Any:
+            state = move(state, (), {})
+            return state, (state.z, {name: getattr(state, name) for name in FIELDS})
 
-            def one(state: Any, _: None) -> Any:
-                state = move(state, (arrays,), {})
-                return state, (state.z, {name: getattr(state, name) for name in FIELDS})
-
-            last, (x, fields) = lax.scan(one, state, None, length=warmup + draws)
-            kept = {name: values[warmup:] for name, values in fields.items()}
-            return x[warmup:], kept, last.adapt_state.step_size, has_slope
-
-        run = jax.jit(jax.vmap(chain, in_axes=(0, 0, None, None, None, None)))
-        if fixed is not None:  # drop the code that was compiled for the data of earlier fits
-            for key in [key for key in self._compiled if key[-1] != fixed]:
-                self._compiled.pop(key, None)
-        self._compiled[known] = run
-        return run
+        last, (x, fields) = lax.scan(one, state, None, length=n)
+        return last, x, fields
 
 
-def free_shapes(model: FunctionModel, sites: Mapping[str, Site], data: Data) -> dict[str, Any]:
-    """Return zeros of the shape of each variable in unconstrained space."""
-
-    def run(key: jax.Array) -> dict[str, Any]:
-        values = model.prior(key, data)
-        return model.unconstrain({name: values[name] for name in sites}, data)
-
-    shapes = jax.eval_shape(run, jax.random.key(0))
-    return {name: np.zeros(shapes[name].shape) for name in sorted(sites)}
+def log_density_of(model: FunctionModel, coordinates: Coordinates, x: Any, data: Data) -> Any:
+    """Compute the log posterior density, up to a constant, at coordinates (coordinate,) in JAX."""
+    z = coordinates.unconstrained(x)
+    return coordinates.log_jacobian(x) - model.potential(z, data, coordinates.deviations)
 
 
-def coordinates_of(z: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return values (chain, draw, ...) in unconstrained space as an array (point, coordinate)."""
-    parts = [np.reshape(z[name], (z[name].shape[0] * z[name].shape[1], -1)) for name in sorted(z)]
-    return np.concatenate(parts, axis=1)
+def require_gradient(model: FunctionModel, coordinates: Coordinates, data: Data) -> None:
+    """Raise TrustboError if JAX cannot differentiate the density of a function.
+
+    The gradient is traced without computing anything.
+    """
+
+    def slope(x: Any) -> Any:
+        return jax.grad(lambda x: log_density_of(model, coordinates, x, data))(x)
+
+    try:
+        with own_settings():
+            jax.eval_shape(slope, np.zeros(coordinates.n))
+    except TrustboError:
+        raise
+    except Exception as error:
+        reason = reason_of(error).rstrip(".")
+        raise TrustboError(
+            f"{model.in_short()} has no gradient, which NUTS needs: {reason}. Use jax.lax.scan for "
+            "loops, or jax.lax.fori_loop with constant bounds, and define the gradient of "
+            "callbacks with jax.custom_jvp or jax.custom_vjp."
+        ) from error
 
 
 def joined_samples(runs: Sequence[Samples]) -> Samples:
-    """Join the draws of runs, chain by chain."""
-    names = runs[0].z
-    fields = runs[0].fields
-    return Samples(
-        {name: np.concatenate([run.z[name] for run in runs], axis=1) for name in names},
-        {name: np.concatenate([run.fields[name] for run in runs], axis=1) for name in fields},
-        runs[-1].step_size,
-    )
-
-
-def cold_start(n: int, chains: int, seed: int) -> Start:
-    """Return a start without a previous posterior, for n coordinates."""
-    rng = np.random.default_rng([seed, 1])
-    x = rng.uniform(-_RADIUS, _RADIUS, (chains, _CANDIDATES, n))
-    mass = np.eye(n) if n <= _MOST_DENSE else np.ones(n)
-    return Start(x, _FIRST_STEP, mass)
-
-
-def warm_start(x: np.ndarray, step_size: float, chains: int, seed: int) -> Start:
-    """Return a start from draws x (draw, coordinate) of a previous posterior."""
-    rng = np.random.default_rng([seed, 1])
-    chosen = x[rng.integers(len(x), size=(chains, _CANDIDATES))]
-
-    variance = x.var(0)
-    mass = variance
-    if x.shape[1] <= _MOST_DENSE:
-        mass = np.cov(x.T).reshape(x.shape[1], -1) + _RIDGE * np.diag(variance)
-    return Start(chosen, step_size, mass)
+    """Join draws that follow each other, chain by chain."""
+    fields = {name: np.concatenate([run.fields[name] for run in runs], axis=1) for name in FIELDS}
+    return Samples(np.concatenate([run.x for run in runs], axis=1), fields)

@@ -1,0 +1,419 @@
+"""The choice of a sampler for a NumPyro function, and the checks of its draws."""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import xarray as xr
+
+from trustbo.display import joined as joined_names
+from trustbo.display import slow_bar
+from trustbo.errors import warn
+from trustbo.inference import mixtures
+from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, statistics_of
+from trustbo.inference.draws import joined_draws
+from trustbo.inference.functions.coordinates import Coordinates
+from trustbo.inference.functions.data import RATES, Data
+from trustbo.inference.functions.function import FunctionModel
+from trustbo.inference.functions.nuts import (
+    Chains,
+    Samples,
+    Start,
+    joined_samples,
+    log_density_of,
+    require_gradient,
+)
+from trustbo.inference.functions.sites import Site, safe
+from trustbo.models.backend import own_settings
+from trustbo.streams import stream
+
+AUTO, IMPORTANCE, NUTS = SAMPLERS = ("auto", "importance", "nuts")
+"""Names of the samplers of functions."""
+_WARMUP = 300
+"""Warm-up draws per chain of NUTS, which are discarded."""
+_ACCEPT = 0.95
+"""Target of the acceptance probability."""
+_LAST_ACCEPT = 0.99
+"""Target of the acceptance probability after many divergent transitions."""
+_TOLERATED = 0.005
+"""Fraction of divergent transitions that is accepted, with a warning."""
+_MOST_DRAWS = 4000
+"""Number of draws per chain after which NUTS is not continued."""
+_ROUGH_RHAT = 1.1
+"""Largest R-hat of the drift and the noises that the last check accepts, with a warning."""
+_ROUGH_ESS = 50.0
+"""Smallest bulk ESS of the drift and the noises that the last check accepts."""
+_CHECKED = 100
+"""Largest number of measured bounds whose drift is checked."""
+_N_STARTS = 1000
+"""Largest number of draws of a previous posterior to which the first proposal is fitted."""
+
+
+class Drawn(NamedTuple):
+    """Draws from the posterior of a function."""
+
+    values: dict[str, np.ndarray]
+    """Values (draw, ...) of the variables, with chains joined."""
+    statistics: dict[str, np.ndarray]
+    """Statistics (chain, draw) of the sampler, by ArviZ's names."""
+    attrs: dict[str, Any]
+    """Name of the sampler, and its diagnostics."""
+    complaints: list[str]
+    """Failed checks."""
+
+
+class Target:
+    """Posterior of a function given data, in some coordinates."""
+
+    def __init__(
+        self,
+        model: FunctionModel,
+        data: Data,
+        sites: Mapping[str, Site],
+        deviations: Collection[str] = (),
+    ) -> None:
+        """Set the coordinates; see `Coordinates.deviations`."""
+        self.model = model
+        self.data = data
+        self.sites = sites
+        self.coordinates = Coordinates(model.free(data), model.noises(data), deviations)
+
+    def log_density(self, x: np.ndarray) -> np.ndarray:
+        """Compute the log density (point,) of points (point, coordinate)."""
+
+        def one(x: Any, data: Data) -> Any:
+            return log_density_of(self.model, self.coordinates, x, data)
+
+        return self._in_batches("log density", one, x)
+
+    def points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Convert values (draw, ...) of the variables to coordinates (draw, coordinate)."""
+
+        def one(values: Mapping[str, Any], data: Data) -> Any:
+            free = self.model.unconstrain(values, data, self.coordinates.deviations)
+            return self.coordinates.of(free)
+
+        return self._in_batches("points", one, dict(values))
+
+    def values(self, x: np.ndarray) -> dict[str, np.ndarray]:
+        """Convert coordinates (draw, coordinate) to values (draw, ...) of the variables."""
+
+        def one(x: Any, data: Data) -> Any:
+            free = self.coordinates.unconstrained(x)
+            return self.model.constrain(free, data, self.coordinates.deviations)
+
+        return self._in_batches("values", one, x)
+
+    def _in_batches(self, name: str, compute: Callable[..., Any], draws: Any) -> Any:
+        """Compute a function of draws, whose arrays have the axis (draw,).
+
+        It is compiled for one number of draws.
+        """
+        key = (name, self.coordinates.key)
+        compiled = self.model.compiled_over_draws(key, compute, 1, self.data)
+
+        n = len(jax.tree.leaves(draws)[0])
+        n_missing = -n % mixtures.BATCH
+        whole = jax.tree.map(lambda a: np.concatenate([a, a[:1].repeat(n_missing, 0)]), draws)
+        parts = [
+            compiled(jax.tree.map(lambda a, k=k: a[k : k + mixtures.BATCH], whole))
+            for k in range(0, n, mixtures.BATCH)
+        ]
+        return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:n], *parts)
+
+    def finite_points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return `points`, without draws that have infinite coordinates."""
+        x = self.points(values)
+        return x[np.isfinite(x).all(1)]
+
+
+def targets_of(model: FunctionModel, data: Data, sites: Mapping[str, Site]) -> list[Target]:
+    """Return the posterior in all coordinates in which it is sampled.
+
+    If means or standard deviations of normal variables are variables, too, the first coordinates
+    are deviations, and the second ones are not (centred and non-centred parametrisations;
+    Papaspiliopoulos, Roberts and Skold 2007). Deviations suit few data.
+    """
+    scales = model.over_draws("scales", 1, data)(keys_of(2, 0))
+    moving = [
+        name
+        for name, pair in scales.items()
+        if any(not np.array_equal(one[0], one[1]) for one in pair)
+    ]
+    if not moving:
+        return [Target(model, data, sites)]
+    return [Target(model, data, sites, moving), Target(model, data, sites)]
+
+
+def sampled(
+    targets: Sequence[Target],
+    prior: Mapping[str, np.ndarray],
+    previous: xr.DataTree | None,
+    sampler: str,
+    *,
+    chains: int,
+    draws: int,
+    warmup: int | None,
+    seed: int,
+    progress: bool,
+    check: bool,
+) -> Drawn:
+    """Sample a posterior by importance sampling, or by NUTS where this fails.
+
+    Args:
+        targets: The posterior in all coordinates; see `targets_of`.
+        prior: Values (draw, ...) of the variables, drawn from the prior.
+        previous: Posterior of the same function given similar data, or None.
+        sampler: One of `SAMPLERS`.
+        chains: Number of chains of NUTS.
+        draws: Number of draws per chain; importance sampling draws as many in one chain.
+        warmup: Number of warm-up draws per chain.
+        seed: Random seed.
+        progress: Whether to show progress bars after 2 seconds.
+        check: Whether NUTS is continued until its diagnostics are good.
+    """
+    target = targets[0]
+    known = _values_of(previous, target, seed)
+    found = None
+    if sampler != NUTS:
+        starts = [prior] if known is None else [known, prior]
+        with slow_bar("fit", " points", progress) as bar:
+            charts = [_chart(one, target, starts, bar) for one in targets]
+            found = mixtures.sample(charts, seed)
+        if sampler == IMPORTANCE or not found.complaints:
+            return _resampled(target, found, chains * draws, seed)
+
+    require_gradient(target.model, target.coordinates, target.data)
+    start = Start.cold(target.coordinates.n, chains, seed)
+    if found is not None:
+        rng = stream(seed, "starts of chains")
+        start = Start.near(found.x[found.resample(_N_STARTS, rng)], chains, seed)
+    elif known is not None:
+        start = Start.near(target.finite_points(known), chains, seed)
+    warmup = _WARMUP if warmup is None else warmup
+    return _by_nuts(target, start, warmup, draws, seed=seed, progress=progress, check=check)
+
+
+def _chart(
+    target: Target, first: Target, starts: Sequence[Mapping[str, np.ndarray]], bar: Any
+) -> mixtures.Chart:
+    """Return the coordinates of a target, which counts points in a progress bar."""
+
+    def log_density(x: np.ndarray) -> np.ndarray:
+        bar.update(len(x))
+        return target.log_density(x)
+
+    points = [target.finite_points(values) for values in starts]
+    return mixtures.Chart(
+        log_density,
+        [x for x in points if len(x)],
+        to_first=lambda x: x if target is first else first.points(target.values(x)),
+        from_first=lambda x: x.copy() if target is first else target.points(first.values(x)),
+    )
+
+
+def _values_of(
+    previous: xr.DataTree | None, target: Target, seed: int
+) -> dict[str, np.ndarray] | None:
+    """Return values (draw, ...) of draws of a previous posterior of the same function.
+
+    Variables of missions that it does not have are drawn from the prior given the others. The
+    result is None if there is no such posterior, or if it has other variables.
+    """
+    model = target.model
+    if previous is None or previous.attrs["model_record"] != model.text:
+        return None
+
+    draws = previous["posterior"].to_dataset()
+    stored = {name: joined_draws(draws[safe(name)]) for name in target.sites if safe(name) in draws}
+    n_draws = len(next(iter(stored.values()), []))
+    chosen = np.linspace(0, n_draws - 1, min(n_draws, _N_STARTS)).astype(int)
+    values = {name: array[chosen] for name, array in stored.items()}
+
+    common = {}
+    for name, site in target.sites.items():
+        if site.mission_axis is None:
+            if name not in values or values[name].shape[1:] != site.shape:
+                return None
+            common[name] = values[name]
+    if len(common) == len(target.sites):
+        return common
+    if not common:
+        return None
+
+    keys = keys_of(len(chosen), seed)
+    drawn = dict(model.over_draws("prior_given", 2, target.data)(common, keys))
+    for name, site in target.sites.items():
+        if site.mission_axis is not None and name in values:
+            shape = values[name].shape[1:]
+            if len(shape) == len(site.shape) and np.all(np.less_equal(shape, site.shape)):
+                drawn[name] = drawn[name].copy()
+                drawn[name][(slice(None), *map(slice, shape))] = values[name]
+    return drawn
+
+
+def _resampled(target: Target, found: mixtures.Sample, n: int, seed: int) -> Drawn:
+    """Return n equally weighted draws of weighted points."""
+    chosen = found.resample(n, stream(seed, "draws of points"))
+    attrs = {
+        "sampler": IMPORTANCE,
+        "k_hat": found.k_hat,
+        "kish": found.kish,
+        "log_evidence": found.log_evidence,
+    }
+    lp = found.log_p[chosen][None]
+    return Drawn(target.values(found.x[chosen]), {"lp": lp}, attrs, found.complaints)
+
+
+class Verdict(NamedTuple):
+    """Diagnostics of samples of NUTS."""
+
+    diagnostics: dict[str, float]
+    complaints: list[str]
+    """Failed checks."""
+    not_identified: list[str]
+    """Variables whose chains differ although the chains of the drift and the noises agree."""
+
+
+def _by_nuts(
+    target: Target,
+    start: Start,
+    warmup: int,
+    draws: int,
+    *,
+    seed: int,
+    progress: bool,
+    check: bool,
+) -> Drawn:
+    """Run NUTS until the diagnostics are good or many draws have been taken.
+
+    The requested number of draws is kept, evenly spaced, or all draws if the checks need more. If
+    many transitions diverge, the chains start again from their draws, once, with smaller steps.
+    """
+    options: dict[str, Any] = {"warmup": warmup, "seed": seed, "progress": progress}
+    chains = Chains(target.model, target.coordinates, target.data, accept=_ACCEPT, **options)
+    samples = chains.run(start, draws)
+    if check and samples.fields["diverging"].mean() > _TOLERATED:
+        start = Start.near(samples.points, len(start.x), seed + 1)
+        chains = Chains(
+            target.model, target.coordinates, target.data, accept=_LAST_ACCEPT, **options
+        )
+        samples = chains.run(start, draws)
+
+    patient = False
+    verdict = _judge(target, samples, patient=False)
+    while verdict.complaints and check:
+        patient = True
+        is_last = samples.x.shape[1] >= _MOST_DRAWS
+        verdict = _judge(target, samples, patient=True, last=is_last)
+        if not verdict.complaints or is_last:
+            break
+        samples = joined_samples([samples, chains.proceed(samples.x.shape[1])])
+
+    few = samples.some(draws)
+    of_few = verdict if few.x.shape == samples.x.shape else _judge(target, few, patient=patient)
+    if not of_few.complaints:
+        samples, verdict = few, of_few
+
+    attrs = {"sampler": NUTS, **verdict.diagnostics, "not_identified": verdict.not_identified}
+    statistics = statistics_of(samples.fields)
+    if not verdict.complaints:
+        _warn(target.model, verdict, statistics["diverging"].size)
+    return Drawn(target.values(samples.points), statistics, attrs, verdict.complaints)
+
+
+def _judge(target: Target, samples: Samples, *, patient: bool, last: bool = False) -> Verdict:
+    """Check the chains of the variables or, if `patient`, of the quantities that plans depend on.
+
+    Variables may differ between chains although the drift does not. An example is the weights of a
+    neural network, whose units can be exchanged. Therefore, if `patient` is true and the chains of
+    the variables are bad, those of the drift and the noises are checked instead. With `patient`, a
+    few divergences are also accepted. In the `last` check, the limits for the drift and the noises
+    are wider, because plans from a rough posterior are better than plans that ignore a mission.
+    """
+    diverging = samples.fields["diverging"]
+    most = int(_TOLERATED * diverging.size) if patient else 0
+    shape = diverging.shape
+    of_variables = {
+        name: samples.x[..., [name == own for own in target.coordinates.names]]
+        for name in target.sites
+    }
+    found, complaints = complaints_of(of_variables, diverging, max_divergences=most)
+    if not complaints or not patient:
+        return Verdict(found, complaints, [])
+
+    values = target.values(samples.points)
+    used = _used_by_plans(target, values, shape)
+    limits: dict[str, Any] = {"max_divergences": most}
+    if last:
+        limits |= {"max_rhat": _ROUGH_RHAT, "min_ess": _ROUGH_ESS}
+    found, complaints = complaints_of(used, diverging, **limits)
+    if complaints:
+        return Verdict(found, complaints, [])
+
+    # A variable that is itself a noise has the same chains, so the same limits apply to it.
+    alone = {
+        name: complaints_of({name: v.reshape(*shape, -1)}, diverging, **limits)[1]
+        for name, v in values.items()
+    }
+    return Verdict(found, [], [name for name, failed in alone.items() if failed])
+
+
+def _used_by_plans(
+    target: Target, values: Mapping[str, np.ndarray], shape: Sequence[int]
+) -> dict[str, np.ndarray]:
+    """Return the drift in some measured bounds and the form, of shape (chain, draw, number)."""
+    n_draws = shape[0] * shape[1]
+    space, inputs = target.model.over_draws("form", 2, target.data)(values, keys_of(n_draws, 0))
+
+    measured = np.flatnonzero(~np.isnan(target.data[RATES].ravel()))
+    some = measured[np.linspace(0, len(measured) - 1, min(_CHECKED, len(measured))).astype(int)]
+    drift = (inputs.drift + inputs.offset).reshape(n_draws, -1)[:, some]
+
+    used = {"drift": drift}
+    for name, value in space._asdict().items():
+        if value is None:
+            continue
+        # A variance is checked as the sd that the user gave, because their R-hats differ.
+        is_variance = name.endswith("_cov") and value.shape[-1] == 1
+        used[name] = np.sqrt(value) if is_variance else value
+    return {name: v.reshape(*shape, -1) for name, v in used.items()}
+
+
+def _warn(model: FunctionModel, verdict: Verdict, n_transitions: int) -> None:
+    """Warn about diagnostics that were accepted although they exceed the usual limits."""
+    n_diverged = int(verdict.diagnostics["divergences"])
+    r_hat = verdict.diagnostics["r_hat"]
+    ess = verdict.diagnostics["ess_bulk"]
+    is_rough = r_hat > MAX_RHAT or ess < MIN_ESS
+
+    if n_diverged:
+        warn(
+            f"{n_diverged} of {n_transitions} transitions diverged, even with small steps: draws "
+            f"of {model.in_short()} may miss narrow parts of the posterior. Narrower priors or "
+            "another parametrisation help."
+        )
+    if is_rough:
+        warn(
+            f"the posterior of {model.in_short()} is rough: R-hat of its drift and noises is "
+            f"{r_hat:.3f}, bulk ESS {ess:.0f}. More draws and warmup, narrower priors or fewer "
+            "variables help."
+        )
+    if verdict.not_identified:
+        names = joined_names(verdict.not_identified)
+        chains = f"the chains of {names} differ or have too few draws"
+        if is_rough:
+            text = f"{chains}, even under the wider limits of a rough posterior: do not interpret"
+            warn(f"{text} these variables.")
+        else:
+            warn(
+                f"{chains}, but those of the drift and noises agree: plans and predictions can be "
+                "used, these variables cannot."
+            )
+
+
+def keys_of(n: int, seed: int) -> Any:
+    """Return n random keys."""
+    with own_settings():
+        return jax.random.split(jax.random.key(seed), n)
