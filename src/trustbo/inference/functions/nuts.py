@@ -26,8 +26,6 @@ from trustbo.models.backend import own_settings
 
 _CANDIDATES = 16
 """Number of candidates for the start of a chain; the one with the largest density is chosen."""
-_RADIUS = 2.0
-"""Candidates are uniform in (-2, 2) in unconstrained space, as in Stan and NumPyro."""
 _FIRST_STEP = 0.1
 """Initial step size of the warm-up."""
 _MOST_DENSE = 50
@@ -47,13 +45,6 @@ class Start(NamedTuple):
     """Candidates, shape (chain, candidate, coordinate)."""
     inverse_mass: np.ndarray
     """Inverse mass matrix (coordinate, coordinate), or its diagonal (coordinate,)."""
-
-    @classmethod
-    def cold(cls, n: int, chains: int, seed: int) -> "Start":
-        """Return a start without draws, for n coordinates."""
-        rng = np.random.default_rng([seed, 1])
-        x = rng.uniform(-_RADIUS, _RADIUS, (chains, _CANDIDATES, n))
-        return cls(x, np.eye(n) if n <= _MOST_DENSE else np.ones(n))
 
     @classmethod
     def near(cls, x: np.ndarray, chains: int, seed: int) -> "Start":

@@ -176,21 +176,20 @@ def sampled(
     target = targets[0]
     known = _values_of(previous, target, seed)
     found = None
-    if sampler != NUTS:
+    if sampler != NUTS or known is None:  # also for the starts of NUTS
         starts = [prior] if known is None else [known, prior]
         with slow_bar("fit", " points", progress) as bar:
             charts = [_chart(one, target, starts, bar) for one in targets]
             found = mixtures.sample(charts, seed)
-        if sampler == IMPORTANCE or not found.complaints:
+        if sampler == IMPORTANCE or (sampler == AUTO and not found.complaints):
             return _resampled(target, found, chains * draws, seed)
 
     require_gradient(target.model, target.coordinates, target.data)
-    start = Start.cold(target.coordinates.n, chains, seed)
-    if found is not None:
-        rng = stream(seed, "starts of chains")
-        start = Start.near(found.x[found.resample(_N_STARTS, rng)], chains, seed)
-    elif known is not None:
-        start = Start.near(target.finite_points(known), chains, seed)
+    if found is None:
+        x = target.finite_points(known or prior)
+    else:
+        x = found.x[found.resample(_N_STARTS, stream(seed, "starts of chains"))]
+    start = Start.near(x, chains, seed)
     warmup = _WARMUP if warmup is None else warmup
     return _by_nuts(target, start, warmup, draws, seed=seed, progress=progress, check=check)
 
