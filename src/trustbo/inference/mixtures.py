@@ -314,8 +314,7 @@ def sample(charts: Sequence[Chart], seed: int) -> Sample:
                 mixture, log_beta = search(chart.log_density, chart.starts, wanted, rng)
                 if log_beta < 0.0:
                     return _failed(chart, mixture, log_beta, rng)
-                enough = _ENOUGH / len(charts)
-                parts.append(_refined(chart.log_density, mixture, enough, rng))
+                parts.append(_refined(chart.log_density, mixture, rng))
 
             runs.append(_Run(charts, parts))
             if not runs[-1].is_good:
@@ -380,7 +379,7 @@ class _Run:
     @property
     def is_good(self) -> bool:
         """Whether enough points are effective, and k-hat is good."""
-        return _is_good(self.log_weight(), _ENOUGH)
+        return _is_good(self.log_weight())
 
 
 def search(
@@ -488,9 +487,7 @@ def _fitted_to(x: np.ndarray, rng: np.random.Generator) -> Mixture:
     return Mixture.near(x, weight, _n_components(x.shape[1]), rng).fitted(x, weight)
 
 
-def _refined(
-    log_density: LogDensity, mixture: Mixture, enough: float, rng: np.random.Generator
-) -> _Rounds:
+def _refined(log_density: LogDensity, mixture: Mixture, rng: np.random.Generator) -> _Rounds:
     """Draw large rounds from mixtures that are fitted to all of their points."""
     found = mixture
     n_components = _n_components(found.center.shape[1])
@@ -499,7 +496,7 @@ def _refined(
         proposal = Mixture.joined([mixture, mixture.wider(), found], _SHARES)
         rounds.add(proposal, _LARGE, log_density, rng)
         log_weight = rounds.log_weight()
-        if _is_good(log_weight, enough) or len(rounds.proposals) == _MOST_LARGE:
+        if _is_good(log_weight) or len(rounds.proposals) == _MOST_LARGE:
             return rounds
 
         weight, _, _ = smoothed(log_weight)
@@ -518,10 +515,10 @@ def _ratio(log_p: np.ndarray, log_q: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(log_p), log_p - np.where(np.isfinite(log_q), log_q, 0.0), -np.inf)
 
 
-def _is_good(log_weight: np.ndarray, enough: float) -> bool:
+def _is_good(log_weight: np.ndarray) -> bool:
     """Return whether enough points are effective, and k-hat is good."""
     weight, k_hat, _ = smoothed(log_weight)
-    return k_hat <= MAX_KHAT and (weight**2).sum() * enough <= 1.0
+    return k_hat <= MAX_KHAT and (weight**2).sum() * _ENOUGH <= 1.0
 
 
 def _pooled(runs: Sequence[_Run]) -> Sample:
