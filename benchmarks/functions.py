@@ -1,17 +1,28 @@
 """Models that are NumPyro functions: time, agreement with model classes, and calibration.
 
-    python benchmarks/functions.py [campaign] [program] [sbc] [--seeds N] [--sets N]
+    python benchmarks/functions.py [campaign] [own_campaign] [program] [samplers] [sbc]
+        [--seeds N] [--sets N] [--functions NAME ...] [--slow]
 
 - campaign: run a campaign of eight missions with a saturating drift. Then run NumPyro's own MCMC
   (NUTS, 4 vectorised chains of 500 + 1000 draws, otherwise with default settings) on the same data:
   after each mission, with a new compilation each time, as a script would, and once on all eight
   missions. Print the CPU time with compilation and the diagnostics of both.
+- own_campaign: run a campaign of ten missions in the terrain example with two of the functions in
+  own_functions.py.
 - program: compare `PooledTrust().program`, passed as a function, with `sampler="nuts"` of the
   class.
+- samplers: fit functions of own_functions.py to ten missions in the terrain example by importance
+  sampling, with three seeds, and once each by trustbo's NUTS and by NumPyro's own MCMC (NUTS, 4
+  vectorised chains of 1000 + 1000 draws, otherwise with default settings). Print the CPU time
+  without compilation. Then compare the means and standard deviations of importance sampling with
+  those of a long run of NUTS. If R-hat of the long run is large, it is no reference. `--slow` adds
+  two functions that take minutes.
 - sbc: check the saturating model, fitted by `tb.fit`, by simulation-based calibration.
 """
 
+import sys
 import time
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +32,16 @@ import numpyro.distributions as dist
 from common import Table, arguments, parsed
 from groups import holm
 from numpyro.infer import MCMC, NUTS, Predictive
+from own_functions import FUNCTIONS
 from scipy import stats
 
 import trustbo as tb
 from trustbo.inference.diagnostics import complaints_of
+from trustbo.inference.functions.data import arrays_of, data_of
 from trustbo.inference.functions.draws import FunctionDraws
 from trustbo.inference.functions.function import as_model
 from trustbo.models import ContactRate, PooledTrust, TrustParams
+from trustbo.models.observations import Observations
 from trustbo.planning.policies import random as random_policy
 
 FEATURES = ("traversability", "line_of_sight")
@@ -36,6 +50,13 @@ MISSIONS = 8
 LEVEL = 0.01  # significance level of sbc, for all parameters together
 RANKED = 99  # draws among which a true parameter is ranked
 PRINTED = 10  # sets between two lines of progress
+SHORT = (
+    "four", "saturating", "weights_by_robot", "hierarchical", "heavy_tailed", "coupled", "ridge",
+    "two_modes", "shared_noise",
+)  # fmt: skip
+SLOW = "hsgp", "neural"
+SEEDS = 1, 2, 3  # of importance sampling; seed 0 compiles
+LONG = {"draws": 5000, "warmup": 1000}  # per chain of the reference
 
 
 def saturating(awareness, contact_rate=None):
@@ -70,58 +91,181 @@ def padded(missions):
     return z, y
 
 
-def own_mcmc(missions, seed):
-    """NumPyro's own MCMC; returns CPU seconds, draws (chain, draw) and the failed checks."""
-    z, y = padded(missions)
-    started = time.process_time()
+def own_mcmc(function, data, seed, *, warmup=500, runs=1):
+    """NumPyro's own MCMC; returns CPU seconds of the last run, diagnostics and failed checks."""
     with jax.enable_x64(True):
-        kernel = NUTS(saturating)
-        mcmc = MCMC(kernel, num_warmup=500, num_samples=1000, num_chains=4,
+        mcmc = MCMC(NUTS(function), num_warmup=warmup, num_samples=1000, num_chains=4,
                     chain_method="vectorized", progress_bar=False)  # fmt: skip
-        mcmc.run(jax.random.key(seed), jnp.asarray(z), jnp.asarray(y))
-        draws = {n: np.asarray(v) for n, v in mcmc.get_samples(group_by_chain=True).items()}
-        diverging = np.asarray(mcmc.get_extra_fields()["diverging"])
-    seconds = time.process_time() - started
+        for run in range(runs):
+            started = time.process_time()
+            mcmc.run(jax.random.key(seed + run), **data)
+            draws = {n: np.asarray(v) for n, v in mcmc.get_samples(group_by_chain=True).items()}
+            diverging = np.asarray(mcmc.get_extra_fields()["diverging"])
+            seconds = time.process_time() - started
     return seconds, *complaints_of(draws, diverging)
 
 
 def campaign(seeds):
-    table = Table("seed", "", "CPU s", "of which fits", "worst ESS", "worst R-hat", "divergences",
+    table = Table("seed", "", "CPU s", "of which fits", "samplers", "fewest effective draws",
                   "learned or good", "compilations")  # fmt: skip
     for seed in range(seeds):
         workspace, simulator = world(seed)
         as_model(saturating).compiled.clear()
-        as_model(saturating).sampler = None
         jax.clear_caches()
         started = time.process_time()
         run = tb.iterate(workspace, START, GOAL, model=saturating, simulator=simulator, seed=seed,
                          policy="thompson", n_iterations=MISSIONS, progress=False)  # fmt: skip
         total = time.process_time() - started
-        fits = sum(tree.attrs["seconds"] for tree in run.posteriors if tree is not None)
-        rows = run.table()
-        table.row(seed, "trustbo, whole campaign", f"{total:.0f}", f"{fits:.0f} (wall)",
-                  f"{rows['ess_bulk'].min():.0f}", f"{rows['r_hat'].max():.3f}",
-                  f"{rows['divergences'].max():.0f}",
-                  f"{(rows['state'] == 'learned').sum()} of {MISSIONS}",
-                  as_model(saturating).sampler.n_compiled)  # fmt: skip
+        fits = [tree.attrs for tree in run.posteriors if tree is not None]
+        learned = (run.table()["state"] == "learned").sum()
+        table.row(seed, "trustbo, whole campaign", f"{total:.0f}",
+                  f"{sum(fit['seconds'] for fit in fits):.0f} (wall)", counted(fits),
+                  f"{min(map(effective, fits)):.0f}", f"{learned} of {MISSIONS}",
+                  n_compiled(as_model(saturating)))  # fmt: skip
 
         own = []
         for n in range(1, MISSIONS + 1):
             jax.clear_caches()
-            own.append(own_mcmc(run.missions[:n], seed))
+            z, y = padded(run.missions[:n])
+            own.append(own_mcmc(saturating, {"awareness": z, "contact_rate": y}, seed))
         seconds = [one[0] for one in own]
         found = [one[1] for one in own]
         good = sum(not one[2] for one in own)
         table.row(seed, "NumPyro, after each mission", f"{sum(seconds):.0f}", "all",
-                  f"{min(f['ess_bulk'] for f in found):.0f}",
-                  f"{max(f['r_hat'] for f in found):.3f}",
-                  f"{max(f['divergences'] for f in found)}", f"{good} of {MISSIONS}",
-                  MISSIONS)  # fmt: skip
-        table.row(seed, "NumPyro, once on all", f"{seconds[-1]:.0f}", "all",
-                  f"{found[-1]['ess_bulk']:.0f}", f"{found[-1]['r_hat']:.3f}",
-                  f"{found[-1]['divergences']}", f"{int(not own[-1][2])} of 1", 1)  # fmt: skip
+                  f"{MISSIONS} nuts", f"{min(f['ess_bulk'] for f in found):.0f}",
+                  f"{good} of {MISSIONS}", MISSIONS)  # fmt: skip
+        table.row(seed, "NumPyro, once on all", f"{seconds[-1]:.0f}", "all", "1 nuts",
+                  f"{found[-1]['ess_bulk']:.0f}", f"{int(not own[-1][2])} of 1", 1)  # fmt: skip
         print(f"  ratio: {total / sum(seconds):.2f} of NumPyro after each mission, "
               f"{total / seconds[-1]:.1f} of NumPyro once", flush=True)  # fmt: skip
+
+
+def effective(attrs):
+    """Effective number of draws: that of the points, or the smallest bulk ESS."""
+    return attrs["kish"] if attrs["sampler"] == "importance" else attrs["ess_bulk"]
+
+
+def counted(fits):
+    """Count the samplers of fits."""
+    samplers = [fit["sampler"] for fit in fits]
+    return ", ".join(f"{samplers.count(name)} {name}" for name in dict.fromkeys(samplers))
+
+
+def n_compiled(model):
+    """Count the programs that were compiled for a function, one for each shape of the data."""
+    return sum(compiled._cache_size() for compiled in model.compiled.values())
+
+
+def own_campaign():
+    workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10))
+    table = Table("function", "CPU s", "learned", "samplers", "warnings")
+    for name in ("saturating", "weights_by_robot"):
+        started = time.process_time()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            run = tb.iterate(workspace, (0, 0), (0, 5), model=FUNCTIONS[name], n_iterations=10,
+                             seed=1, progress=False)  # fmt: skip
+        seconds = time.process_time() - started
+        fits = [tree.attrs for tree in run.posteriors if tree is not None]
+        learned = (run.table()["state"] == "learned").sum()
+        table.row(name, f"{seconds:.0f}", f"{learned} of 10", counted(fits), len(caught))
+        for message in {str(one.message) for one in caught}:
+            print(f"  {message}", flush=True)
+
+
+def in_terrain():
+    """Make ten missions in the terrain example: greedy ones, and two on random paths."""
+    workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10))
+    greedy = tb.iterate(workspace, (0, 0), (0, 5), n_iterations=8, seed=1, progress=False)
+    random = tb.iterate(workspace, (0, 0), (9, 9), n_iterations=2, seed=2, policy="random",
+                        progress=False)  # fmt: skip
+    return [*greedy.missions, *random.missions]
+
+
+def samplers(names):
+    missions = in_terrain()
+    table = Table("function", "sampler", "seed", "CPU s", "effective draws",
+                  "ms per effective draw", "complaints")  # fmt: skip
+    others = []
+    for name in names:
+        function = FUNCTIONS[name]
+
+        def fitted(sampler, seed, function=function, **options):
+            return tb.fit(missions, function, sampler=sampler, seed=seed, latent=False,
+                          progress=False, **options)  # fmt: skip
+
+        def row(sampler, seed, seconds, n, complaints, name=name):
+            table.row(name, sampler, seed, f"{seconds:.1f}", f"{n:.0f}",
+                      f"{1000.0 * seconds / n:.2f}", "; ".join(complaints) or "none")  # fmt: skip
+
+        found = []
+        fitted("importance", 0, check=False)
+        for seed in SEEDS:
+            tree, seconds, complaints = timed_fit(fitted, "importance", seed)
+            row("importance", seed, seconds, effective(tree.attrs), complaints)
+            found.append(moments(tree))
+
+        long = fitted("nuts", 0, check=False, **LONG)  # it also compiles
+        tree, seconds, complaints = timed_fit(fitted, "nuts", 1)
+        row("nuts", 1, seconds, effective(tree.attrs), complaints)
+
+        data = unpadded(as_model(function), missions)
+        seconds, diagnosed, complaints = own_mcmc(function, data, 0, warmup=1000, runs=2)
+        row("NumPyro", 1, seconds, diagnosed["ess_bulk"], complaints)
+        others.append((name, *differences(found, long)))
+        print(f"  {name}: {others[-1][1:]}", file=sys.stderr, flush=True)
+
+    table = Table("function", "largest difference of means, sd", "of", "ratios of sds",
+                  "R-hat of the long run", "its ESS", "its divergences")  # fmt: skip
+    for cells in others:
+        table.row(*cells)
+
+
+def timed_fit(fitted, sampler, seed):
+    """Fit with the checks of users; return the posterior, CPU seconds, and complaints."""
+    started = time.process_time()
+    complaints = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            tree = fitted(sampler, seed)
+        except tb.errors.PosteriorError as error:
+            tree = error.posterior
+            complaints.append(f"refused: {error.reason}")
+    seconds = time.process_time() - started
+    return tree, seconds, complaints + [f"warning: {one.message}" for one in caught]
+
+
+def unpadded(model, missions):
+    """Return the inputs that a function takes, as arrays without padding."""
+    observations = Observations.from_missions(missions)
+    n_missions, n_bounds = observations.contact_rate.shape[:2]
+    arrays = arrays_of(data_of(missions, observations, moves=False))
+    data = {name: array[:n_missions, :n_bounds] for name, array in arrays.items()}
+    data |= {"features": missions[0].features, "observations": observations}
+    return {name: data[name] for name in model.inputs}
+
+
+def moments(tree):
+    """Mean and sd of all variables, by name."""
+    draws = tree["posterior"].to_dataset().stack(sample=("chain", "draw"))
+    arrays = {name: draws[name].transpose(..., "sample").values for name in draws.data_vars}
+    return {name: (array.mean(-1), array.std(-1)) for name, array in arrays.items()}
+
+
+def differences(found, long):
+    """Compare the moments of several fits with those of a long run of NUTS."""
+    wanted = moments(long)
+    apart = {
+        name: max(float((np.abs(one[name][0] - mean) / sd).max()) for one in found)
+        for name, (mean, sd) in wanted.items()
+    }
+    farthest = max(apart, key=apart.get)
+    ratios = [one[name][1] / sd for one in found for name, (_, sd) in wanted.items()]
+    ratios = np.concatenate([np.ravel(ratio) for ratio in ratios])
+    return (f"{apart[farthest]:.3f}", farthest, f"{ratios.min():.3f} to {ratios.max():.3f}",
+            f"{long.attrs['r_hat']:.3f}", f"{long.attrs['ess_bulk']:.0f}",
+            int(long.attrs["divergences"]))  # fmt: skip
 
 
 def program(seeds):
@@ -240,15 +384,22 @@ def sbc(sets):
           "diagnostics", flush=True)  # fmt: skip
 
 
-PARTS = {"campaign": campaign, "program": program}
+PARTS = "campaign", "own_campaign", "program", "samplers", "sbc"
 
 if __name__ == "__main__":
-    parser = arguments(__doc__, names=(*PARTS, "sbc"), seeds=3)
+    parser = arguments(__doc__, names=PARTS, seeds=3)
     parser.add_argument("--sets", type=int, default=100, help="data sets of sbc, default 100")
+    parser.add_argument("--functions", nargs="+", choices=FUNCTIONS, metavar="NAME",
+                        help="functions of samplers")  # fmt: skip
+    parser.add_argument("--slow", action="store_true", help="add slow functions to samplers")
     given = parsed(parser)
+    calls = {
+        "campaign": lambda: campaign(given.seeds),
+        "own_campaign": own_campaign,
+        "program": lambda: program(given.seeds),
+        "samplers": lambda: samplers(given.functions or SHORT + (SLOW if given.slow else ())),
+        "sbc": lambda: sbc(given.sets),
+    }
     for name in given.names:
         print(name, flush=True)
-        if name == "sbc":
-            sbc(given.sets)
-        else:
-            PARTS[name](given.seeds)
+        calls[name]()
