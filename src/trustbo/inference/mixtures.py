@@ -47,6 +47,13 @@ _WANTED = 300, 600
 second number is that of a second attempt, after two runs that do not agree."""
 _STEP = 0.15
 """Part of this number to which a step of beta may reduce it."""
+_MOST_STRICT = 10
+"""Number of coordinates up to which a step reduces it only after rounds without progress.
+
+Large steps lose modes, but with more coordinates, small ones take too many rounds.
+"""
+_PATIENT = 5
+"""Number of such rounds after which a step may halve it."""
 _GAIN = 0.05
 """Smallest gain of log beta, or of the log effective number of points, that counts as progress."""
 _STALLED = 30
@@ -392,7 +399,8 @@ def search(
     mixture = Mixture.joined(first, shares)
 
     origin = mixture
-    n_components = _n_components(origin.center.shape[1])
+    d = origin.center.shape[1]
+    n_components = _n_components(d)
     rounds = _Rounds(_WINDOW)
     log_beta = _FIRST_LOG_BETA
     best = -np.inf
@@ -403,7 +411,8 @@ def search(
         n_points += BATCH
 
         path = _Path(rounds, origin)
-        log_beta, log_weight = path.next(log_beta, min(wanted, path.n_points / 4))
+        part = _STEP if d > _MOST_STRICT else max(0.5 ** (n_idle // _PATIENT), _STEP)
+        log_beta, log_weight = path.next(log_beta, min(wanted, path.n_points / 4), part)
         weight = special.softmax(log_weight)
         if len(mixture.share) < n_components:
             mixture = Mixture.near(rounds.x, weight, n_components, rng)
@@ -442,14 +451,14 @@ class _Path:
         """Compute the effective number of points for a density of the path."""
         return _n_effective(self.log_weight(log_beta))
 
-    def next(self, log_beta: float, wanted: float) -> tuple[float, np.ndarray]:
+    def next(self, log_beta: float, wanted: float, part: float) -> tuple[float, np.ndarray]:
         """Choose the next density of the path; return its log beta and the log weights (point,).
 
         It is the farthest one for which a part of the wanted number of points is effective. All log
         weights are then made smaller until the wanted number is, which takes a part of the step
         from the proposals to this density.
         """
-        fewest = _STEP * wanted
+        fewest = part * wanted
         if self.n_effective(0.0) >= fewest:
             log_beta = 0.0
         elif self.n_effective(log_beta) >= fewest:
