@@ -25,7 +25,9 @@ from trustbo.inference.functions.function import FunctionModel
 from trustbo.models.backend import own_settings
 
 _CANDIDATES = 16
-"""Number of candidates for the start of a chain; the one with the largest density is chosen."""
+"""Number of candidates for the start of a chain; the first one with a density is chosen."""
+_SMALLEST = 1e-12
+"""Standard deviation by which coordinates that are constant are divided."""
 _FIRST_STEP = 0.1
 """Initial step size of the warm-up."""
 _MOST_DENSE = 50
@@ -50,7 +52,11 @@ class Start(NamedTuple):
     def near(cls, x: np.ndarray, chains: int, seed: int) -> "Start":
         """Return a start from draws x (draw, coordinate) of a similar distribution."""
         rng = np.random.default_rng([seed, 1])
-        chosen = x[rng.integers(len(x), size=(chains, _CANDIDATES))]
+
+        # Each chain starts in its own part along the main axis, so that modes get chains.
+        main = np.linalg.svd((x - x.mean(0)) / np.maximum(x.std(0), _SMALLEST), full_matrices=False)
+        parts = np.array_split(np.argsort(main.U[:, 0], kind="stable"), chains)
+        chosen = np.stack([x[rng.choice(part, _CANDIDATES)] for part in parts])
 
         variance = x.var(0)
         mass = variance
@@ -183,11 +189,14 @@ class Chains:
         return state, move
 
     def _begin(self, key: Any, candidates: Any, mass: Any, data: Data) -> tuple[Any, Any, Any]:
-        """Start a chain at the candidate with the largest density."""
+        """Start a chain at the first candidate that has a density.
+
+        With the largest density instead, all chains would start at the same mode.
+        """
         density = lax.map(
             lambda x: log_density_of(self.model, self.coordinates, x, data), candidates
         )
-        chosen = jnp.argmax(jnp.where(jnp.isfinite(density), density, -jnp.inf))
+        chosen = jnp.argmax(jnp.isfinite(density))
         state, _ = self._kernel(candidates[chosen], mass, key, data)
         return state, jnp.isfinite(density[chosen]), jnp.isfinite(state.z_grad).all()
 
