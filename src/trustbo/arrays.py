@@ -203,6 +203,11 @@ def without_rounding(values: np.ndarray) -> np.ndarray:
     return np.where(np.abs(values - nearest) <= _SHARE_ROUNDING, nearest, values)
 
 
+def evenly_spaced(n: int, n_kept: int) -> np.ndarray:
+    """Return evenly spaced indices of n entries; of all entries, if `n_kept` is n or more."""
+    return np.linspace(0, n - 1, min(n, n_kept)).astype(int)
+
+
 def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:
     """Return names as a tuple; raises TrustboError if one is not a string or is repeated.
 

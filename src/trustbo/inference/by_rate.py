@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 from scipy import sparse
 
+from trustbo.arrays import evenly_spaced
 from trustbo.inference.density import chunks
 from trustbo.inference.draws import as_fitted, missions_of, read_posterior
 from trustbo.inference.functions.fit import forms_of_function
@@ -96,7 +97,7 @@ def by_rate(posterior: xr.DataTree, *, model: Model | None = None) -> xr.DataTre
     n_chains = sizes["chain"]
     n_rates = int(posterior["observed_data"][RATES].notnull().sum()) if _has_data(posterior) else 1
     most = max(_FEWEST_DRAWS, _NUMBERS // max(n_rates, 1)) // n_chains
-    kept = np.linspace(0, sizes["draw"] - 1, min(sizes["draw"], max(most, 1))).astype(int)
+    kept = evenly_spaced(sizes["draw"], max(most, 1))
     some = (np.arange(n_chains)[:, None] * sizes["draw"] + kept).ravel()
 
     learner = learner_of_posterior(posterior, model)

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.arrays import Names, read_labelled
+from trustbo.arrays import Names, evenly_spaced, read_labelled
 from trustbo.data import Cell, require_shares, require_unit_interval
 from trustbo.errors import Renamed, TrustboError, one_line, require_pair, require_whole
 from trustbo.inference.draws import as_fitted
@@ -151,7 +151,7 @@ class TrustFilter:
         flat = posterior.flat()
         [n_draws] = flat.leading
         max_draws = require_whole("max_draws", max_draws, 1)
-        kept = np.linspace(0, n_draws - 1, min(n_draws, max_draws)).astype(int)
+        kept = evenly_spaced(n_draws, max_draws)
         self.params: Draws = flat.draw(kept)
         self.likelihood = FAMILIES[family]
         self.space = self.params.state_space(self._n_robots, adds_noise=self.likelihood.adds_noise)

@@ -22,7 +22,7 @@ from arviz_stats import sampling_diagnostics
 from arviz_stats.utils import ELPDData
 from scipy.special import logsumexp
 
-from trustbo.arrays import in_order
+from trustbo.arrays import evenly_spaced, in_order
 from trustbo.data import Mission
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, warn
@@ -226,7 +226,7 @@ def _of_class(posterior: xr.DataTree, model: Model | None) -> LeftOut:
     # Resampled draws repeat, and the evidence of each distinct draw is computed only once.
     rows = np.column_stack([v.reshape(n_samples, -1) for v in draws.theta.values()])
     _, first, count = np.unique(rows, axis=0, return_index=True, return_counts=True)
-    some = np.linspace(0, len(first) - 1, min(len(first), _POINTS)).astype(int)
+    some = evenly_spaced(len(first), _POINTS)
     theta = at(draws.theta, first[some])
     share = count[some] / count[some].sum()
     whole = fitted.log_evidence(theta)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from trustbo.arrays import evenly_spaced
 from trustbo.data import NOWHERE, Mission
 from trustbo.display import slow_bar
 from trustbo.inference.density import Density, JointDraws
@@ -208,7 +209,7 @@ def with_latent(
         prior = parameters_of(posterior, group="prior")
     else:  # the user has dropped it
         prior = prior_parameters(fitted, N_PRIOR, rng)
-    prior = {n: values[_evenly(len(values), _N_TRAJECTORIES)] for n, values in prior.items()}
+    prior = {n: values[evenly_spaced(len(values), _N_TRAJECTORIES)] for n, values in prior.items()}
     replicated = replicate(fitted, with_prior_effects(fitted, prior, rng), rng)
 
     # Single precision halves the memory; the error is far below the Monte Carlo error.
@@ -277,7 +278,7 @@ def add_groups(
     prior: dict[str, Any] = {}
     if "prior" in posterior.children:
         prior = {name: posterior["prior"][name].values for name in ("chain", "draw")}
-        prior["draw"] = prior["draw"][_evenly(len(prior["draw"]), len(replicated))]
+        prior["draw"] = prior["draw"][evenly_spaced(len(prior["draw"]), len(replicated))]
     for name, of_draws in (
         ("log_likelihood", labels),
         ("log_prior", labels),
@@ -297,13 +298,8 @@ def kept_draws(posterior: xr.DataTree) -> tuple[np.ndarray, np.ndarray]:
     sizes = posterior["posterior"].sizes
     n_chains = sizes["chain"]
     n_draws = sizes["draw"]
-    kept = _evenly(n_draws, max(1, _N_TRAJECTORIES // n_chains))
+    kept = evenly_spaced(n_draws, max(1, _N_TRAJECTORIES // n_chains))
     return kept, (np.arange(n_chains)[:, None] * n_draws + kept).ravel()
-
-
-def _evenly(n: int, n_kept: int) -> np.ndarray:
-    """Return the indices of evenly spaced draws; of all draws, if `n_kept` is `n` or more."""
-    return np.linspace(0, n - 1, min(n, n_kept)).astype(int)
 
 
 def log_prior(fitted: Density, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

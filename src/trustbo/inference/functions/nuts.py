@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from numpyro.infer.hmc import hmc
 
+from trustbo.arrays import evenly_spaced
 from trustbo.display import announced, slow_bar
 from trustbo.errors import TrustboError
 from trustbo.inference.diagnostics import FIELDS
@@ -75,8 +76,7 @@ class Samples(NamedTuple):
 
     def some(self, draws: int) -> "Samples":
         """Return `draws` evenly spaced draws of each chain."""
-        n = self.x.shape[1]
-        kept = np.linspace(0, n - 1, min(draws, n)).astype(int)
+        kept = evenly_spaced(self.x.shape[1], draws)
         fields = {name: values[:, kept] for name, values in self.fields.items()}
         return Samples(self.x[:, kept], fields)
 

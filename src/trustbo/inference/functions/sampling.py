@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import xarray as xr
 
+from trustbo.arrays import evenly_spaced
 from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
 from trustbo.errors import warn
@@ -227,7 +228,7 @@ def _values_of(
     draws = previous["posterior"].to_dataset()
     stored = {name: joined_draws(draws[safe(name)]) for name in target.sites if safe(name) in draws}
     n_draws = len(next(iter(stored.values()), []))
-    chosen = np.linspace(0, n_draws - 1, min(n_draws, _N_STARTS)).astype(int)
+    chosen = evenly_spaced(n_draws, _N_STARTS)
     values = {name: array[chosen] for name, array in stored.items()}
 
     common = {}
@@ -367,7 +368,7 @@ def _used_by_plans(
     space, inputs = target.model.over_draws("form", 2, target.data)(values, keys_of(n_draws, 0))
 
     measured = np.flatnonzero(~np.isnan(target.data[RATES].ravel()))
-    some = measured[np.linspace(0, len(measured) - 1, min(_CHECKED, len(measured))).astype(int)]
+    some = measured[evenly_spaced(len(measured), _CHECKED)]
     drift = (inputs.drift + inputs.offset).reshape(n_draws, -1)[:, some]
 
     used = {"drift": drift}
