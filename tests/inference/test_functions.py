@@ -29,8 +29,8 @@ from trustbo.inference.functions.data import data_of
 from trustbo.inference.functions.function import as_model, model_of_record
 from trustbo.inference.functions.identity import constants_of, fingerprint
 from trustbo.inference.functions.nuts import Samples
-from trustbo.inference.functions.sampling import Target
 from trustbo.inference.functions.sampling import _judge as judge
+from trustbo.inference.functions.sampling import targets_of
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.backend import own_settings
@@ -748,7 +748,7 @@ def test_a_noise_is_not_called_unidentified_where_the_noises_are_accepted(missio
 
     data = data_of(missions, Observations.from_missions(missions))
     function = as_model(model)
-    target = Target(function, data, function.sites(data))
+    [target] = targets_of(function, data, function.sites(data))
     assert target.coordinates.names == ["delta_v", "delta_w", "unused"]
     strict = judge(target, samples, patient=True)
     rough = judge(target, samples, patient=True, last=True)

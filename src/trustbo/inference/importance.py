@@ -241,13 +241,8 @@ class Points(NamedTuple):
         return Student.from_points(self.z, weight, self.near)
 
     def resample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw indices of `n` equally weighted points.
-
-        Points are in random order, but repetitions of a point are next to each other. Therefore,
-        the effective sample size that ArviZ computes from autocorrelations is close to `kish`.
-        """
-        order = rng.permutation(len(self.z))
-        return order[systematic(self.weight[order], n, rng)]
+        """Draw indices of `n` equally weighted points; see `resampled`."""
+        return resampled(self.weight, n, rng)
 
 
 def sample(
@@ -439,6 +434,16 @@ def smoothed(log_ratio: np.ndarray, relative: float = 1.0) -> tuple[np.ndarray, 
     log_weight, k_hat = array_stats.psislw(-kept, r_eff=relative)  # pyright: ignore[reportArgumentType]
     k_hat = float(np.nan_to_num(k_hat, nan=np.inf))
     return special.softmax(log_weight), k_hat, log_mean
+
+
+def resampled(weight: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw indices of `n` equally weighted points, given the weights (point,) of points.
+
+    Points are in random order, but repetitions of a point are next to each other. Therefore, the
+    effective sample size that ArviZ computes from autocorrelations is close to that of the weights.
+    """
+    order = rng.permutation(len(weight))
+    return order[systematic(weight[order], n, rng)]
 
 
 def systematic(weight: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:

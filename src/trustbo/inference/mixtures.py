@@ -28,7 +28,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy import special
 
-from trustbo.inference.importance import MAX_KHAT, smoothed, systematic
+from trustbo.inference.importance import MAX_KHAT, resampled, smoothed, systematic
 
 BATCH = 512
 """Number of points of a round of the search; those of larger rounds are a multiple."""
@@ -231,14 +231,9 @@ class Sample(NamedTuple):
         """Effective number of points, which is 1 / sum of squared weights."""
         return 1.0 / float((self.weight**2).sum())
 
-    def mean_and_covariance(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean (coordinate,) and the covariance (coordinate, coordinate)."""
-        return self.weight @ self.x, _covariance(self.x, self.weight)
-
     def resample(self, n: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw indices of n equally weighted points; see `importance.Points.resample`."""
-        order = rng.permutation(len(self.x))
-        return order[systematic(self.weight[order], n, rng)]
+        """Draw indices of n equally weighted points; see `importance.resampled`."""
+        return resampled(self.weight, n, rng)
 
 
 class _Rounds:
@@ -562,7 +557,7 @@ def _disagreements(runs: Sequence[_Run], pooled: Sample) -> list[str]:
         evidences.append(log_evidence)
         errors.append(np.exp(log_weight - log_evidence).std() / np.sqrt(len(log_weight)))
 
-    _, covariance = pooled.mean_and_covariance()
+    covariance = _covariance(pooled.x, pooled.weight)
     apart = np.ptp(means, axis=0) / np.sqrt(np.diag(covariance))
     found = []
     if not apart.max() <= _MEANS_AGREE:

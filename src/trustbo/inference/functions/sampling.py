@@ -1,6 +1,6 @@
 """The choice of a sampler for a NumPyro function, and the checks of its draws."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -72,13 +72,12 @@ class Target:
         model: FunctionModel,
         data: Data,
         sites: Mapping[str, Site],
-        deviations: Collection[str] = (),
+        coordinates: Coordinates,
     ) -> None:
-        """Set the coordinates; see `Coordinates.deviations`."""
         self.model = model
         self.data = data
         self.sites = sites
-        self.coordinates = Coordinates(model.free(data), model.noises(data), deviations)
+        self.coordinates = coordinates
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, coordinate)."""
@@ -142,9 +141,12 @@ def targets_of(model: FunctionModel, data: Data, sites: Mapping[str, Site]) -> l
         for name, pair in scales.items()
         if any(not np.array_equal(one[0], one[1]) for one in pair)
     ]
-    if not moving:
-        return [Target(model, data, sites)]
-    return [Target(model, data, sites, moving), Target(model, data, sites)]
+    free = model.free(data)
+    noises = model.noises(data)
+    return [
+        Target(model, data, sites, Coordinates(free, noises, deviations))
+        for deviations in ((moving, ()) if moving else ((),))
+    ]
 
 
 def sampled(
