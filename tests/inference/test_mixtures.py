@@ -10,7 +10,7 @@ from scipy import stats
 
 import trustbo as tb
 from trustbo.inference.functions.coordinates import Coordinates
-from trustbo.inference.mixtures import Chart, Mixture, sample
+from trustbo.inference.mixtures import Chart, Mixture, Visited, lost_modes, sample
 from trustbo.models import ContactRate
 from trustbo.models.backend import own_settings
 
@@ -70,6 +70,27 @@ def test_runs_that_find_different_modes_do_not_agree(monkeypatch):
     found = sample(only(two_modes), seed=1)
     assert any("standard deviations" in one for one in found.complaints)
     assert any("evidences" in one for one in found.complaints)
+
+
+FIRST_MODE = Mixture(np.ones(1), np.array([[2.0, 0.0]]), 0.1 * np.eye(2)[None])
+
+
+def test_visited_points_show_a_mode_that_the_search_has_lost():
+    visited = Visited(BROAD, two_modes(BROAD), log_evidence=np.log(0.8))
+    found = lost_modes(visited, FIRST_MODE, two_modes)
+    assert len(found)
+    assert (found[:, 0] < 0.0).all()
+
+
+def test_points_in_the_tails_of_a_mode_are_in_no_other_mode():
+    """Cauchy tails are far above those of the mixture."""
+
+    def cauchy(x):
+        return stats.cauchy([2.0, 0.0], 0.1).logpdf(x).sum(1)
+
+    visited = Visited(BROAD, cauchy(BROAD), log_evidence=0.0)
+    assert (visited.log_p - FIRST_MODE.log_density(BROAD)).max() > 10.0
+    assert len(lost_modes(visited, FIRST_MODE, cauchy)) == 0
 
 
 def funnel(x):

@@ -8,6 +8,9 @@ steps twice, with different random numbers:
    has the weight q0 (p / q0)^beta / q, where q0 is the first proposal and q the mixture of the
    proposals of these rounds (Cornuet, Marin, Mira and Robert 2012). beta is as large as leaves
    enough effective points, so mixtures move step by step from the start to the posterior.
+   Then, the points that were drawn on the way are compared with the last mixture. If some of them
+   have a density that is far above it, and lower densities lie between, they belong to a mode that
+   was lost, and another search begins there.
 2. *Refinement.* Larger rounds have proposals with wider components, too, and beta = 1. They end
    when k-hat and the effective number of points are good.
 
@@ -72,6 +75,12 @@ _ENOUGH = 1000.0
 """Effective number of points of each run at which it ends."""
 _WIDER = 1.5
 """Scale of the wide components relative to the others."""
+_LOST = np.log(1000.0)
+"""Log ratio of the posterior to the mixture from which on a point may be in a lost mode."""
+_N_LOST = 8
+"""Largest number of such points that are examined."""
+_BARRIER = 3.0
+"""Smallest difference of log densities that separates a lost mode."""
 _SHARES = 0.7, 0.15, 0.15
 """Shares of the fitted mixture, of its wider copy and of the search's last mixture in a proposal of
 the refinement. The last one covers modes that a fit has lost."""
@@ -155,6 +164,15 @@ class Mixture(NamedTuple):
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, coordinate)."""
         return np.logaddexp.reduce(self._log_parts(x)[0], axis=0)
+
+    def nearest(self, x: np.ndarray) -> np.ndarray:
+        """Return the component (point,) that is most probable at points (point, coordinate)."""
+        return self._log_parts(x)[0].argmax(0)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariances (component, coordinate, coordinate), up to a common factor."""
+        return self.scale @ np.swapaxes(self.scale, 1, 2)
 
     def _log_parts(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute log (share times density), and squared distances, of shape (component, point)."""
@@ -255,6 +273,11 @@ class _Rounds:
     def log_p(self) -> np.ndarray:
         """Log density (point,) of the points."""
         return np.concatenate(self._log_p)
+
+    @property
+    def newest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Points of the last round, and their log densities."""
+        return self._x[-1], self._log_p[-1]
 
     def add(self, proposal: Mixture, n: int, density: LogDensity, rng: np.random.Generator) -> None:
         """Draw n points from a proposal; forget the first round if there are too many."""
@@ -388,6 +411,33 @@ def search(
     log_density: LogDensity, starts: Sequence[np.ndarray], wanted: float, rng: np.random.Generator
 ) -> tuple[Mixture, float]:
     """Search for the posterior; return the last mixture, and log beta, which is 0 at the end."""
+    found, log_beta, visited = _searched(log_density, starts, wanted, rng)
+    if log_beta < 0.0:
+        return found, log_beta
+
+    lost = lost_modes(visited, found, log_density)
+    if len(lost):
+        scale = np.linalg.cholesky(np.tensordot(found.share, found.covariance, 1))
+        share = np.full(len(lost), 1.0 / len(lost))
+        around = Mixture(share, lost, np.repeat(scale[None], len(lost), axis=0))
+        start = around.draw(BATCH, rng)
+        other, log_beta, _ = _searched(log_density, [start], wanted, rng)
+        found = Mixture.joined([found, other], [0.5, 0.5])
+    return found, log_beta
+
+
+class Visited(NamedTuple):
+    """Points of a search, with their log densities, and the log evidence at its end."""
+
+    x: np.ndarray  # (point, coordinate)
+    log_p: np.ndarray  # (point,)
+    log_evidence: float
+
+
+def _searched(
+    log_density: LogDensity, starts: Sequence[np.ndarray], wanted: float, rng: np.random.Generator
+) -> tuple[Mixture, float, Visited]:
+    """Search from some starts; see `search`."""
     first = [_fitted_to(x, rng) for x in starts]
     n_others = len(first) - 1
     shares = [_FIRST, *[(1.0 - _FIRST) / n_others] * n_others] if n_others else [1.0]
@@ -400,10 +450,10 @@ def search(
     log_beta = _FIRST_LOG_BETA
     best = -np.inf
     n_idle = 0
-    n_points = 0
+    visited = []
     while True:
         rounds.add(mixture, BATCH, log_density, rng)
-        n_points += BATCH
+        visited.append(rounds.newest)
 
         path = _Path(rounds, origin)
         part = _STEP if d > _MOST_STRICT else max(0.5 ** (n_idle // _PATIENT), _STEP)
@@ -420,9 +470,34 @@ def search(
         best = max(best, progress)
 
         is_ripe = n_idle >= _RIPE_ROUNDS or progress > np.log(_RIPE)
-        has_failed = n_idle > _STALLED or n_points >= _MOST_SEARCHED
+        has_failed = n_idle > _STALLED or len(visited) * BATCH >= _MOST_SEARCHED
         if (log_beta == 0.0 and is_ripe) or has_failed:
-            return mixture, log_beta
+            x, log_p = (np.concatenate(parts) for parts in zip(*visited, strict=True))
+            return mixture, log_beta, Visited(x, log_p, path.log_evidence)
+
+
+def lost_modes(visited: Visited, found: Mixture, log_density: LogDensity) -> np.ndarray:
+    """Return visited points (point, coordinate) in modes that a mixture has lost.
+
+    On the way from each of them to the nearest component, the density is lower at one place. In the
+    tails of a mode, it is not.
+    """
+    ratio = visited.log_p - found.log_density(visited.x) - visited.log_evidence
+    outside = np.flatnonzero(ratio > _LOST)
+    if not len(outside):
+        return visited.x[:0]
+
+    best = outside[np.argsort(-visited.log_p[outside], kind="stable")[:_N_LOST]]
+    x = visited.x[best]
+    nearest = found.center[found.nearest(x)]
+
+    n_steps = BATCH // _N_LOST
+    step = np.linspace(0.0, 1.0, n_steps)[:, None, None]
+    way = x + step * (nearest - x)
+    way = np.concatenate([way, way[:, :1].repeat(_N_LOST - len(x), axis=1)], axis=1)
+    log_p = log_density(way.reshape(-1, x.shape[1])).reshape(n_steps, _N_LOST)[:, : len(x)]
+    lowest = np.where(np.isfinite(log_p), log_p, -np.inf).min(0)
+    return x[lowest < np.minimum(log_p[0], log_p[-1]) - _BARRIER]
 
 
 class _Path:
@@ -436,6 +511,12 @@ class _Path:
         self._log_ratio = rounds.log_p - self._log_origin
         self._log_q = rounds.log_q()
         self.n_points = len(self._log_q)
+
+    @property
+    def log_evidence(self) -> float:
+        """Log of the integral of the posterior."""
+        log_weight = self._log_origin + self._log_ratio - self._log_q
+        return float(special.logsumexp(log_weight) - np.log(self.n_points))
 
     def log_weight(self, log_beta: float) -> np.ndarray:
         """Compute the log weights (point,) for a density of the path; the largest is 0."""
