@@ -186,37 +186,64 @@ def _read_params(
 
     x0 = {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")}
     memory = posterior.attrs.get("memory", "level")
-    maps = {}
-    places = None
+    theta = model.derived(parameters)
+    return [
+        assemble_params(values, x0, memory)._replace(**places).in_order(*names)  # pyright: ignore
+        for values, places in with_effects(
+            posterior, model.effects, theta, parameters, names[0], next_mission
+        )
+    ]
+
+
+def with_effects(
+    posterior: xr.DataTree,
+    effects: Sequence[Effect],
+    theta: Theta,
+    parameters: Mapping[str, np.ndarray],
+    names: Sequence[str],
+    next_mission: Sequence[bool],
+) -> list[tuple[dict[str, np.ndarray], dict[str, Any]]]:
+    """Return parameters with the effects of robots in the next mission, and those of places.
+
+    Args:
+        posterior: DataTree from `fit`, in the order of its robots and features.
+        effects: Effects of its model.
+        theta: Hyperparameters (draw, ...) of the effects by name.
+        parameters: Parameters (draw, ...) by name, which include the hyperparameters.
+        names: Names of the robots of the result.
+        next_mission: For each result, whether the effects of the next mission are drawn at random,
+            and effects of robots in bounds are included. Otherwise, expected effects are used.
+
+    Returns:
+        Pairs of the parameters, and of the fields of `Params` with the effects of places.
+    """
+    maps: dict[str, Any] = {}
+    of_robots: dict[str, Any] = {}
     if "places" in posterior.children:
         places = posterior["places"].to_dataset()
-        maps = place_maps_of(places, parameters)
+        maps |= place_maps_of(places, parameters)
+        if any(next_mission):
+            of_robots["place_robot"] = robots_in_bounds_of(places, parameters, names)
 
+    values = {effect: values_of(posterior, effect) for effect in _effects_of_robots(effects)}
     found = []
     for is_drawn in next_mission:
-        values = {effect: values_of(posterior, effect) for effect in _effects_of_robots(model)}
         robots = _robot_effects_ahead(
             values,
-            model.derived(parameters),
+            theta,
             parameters,
             features=names_in(posterior, "feature"),
             n_robots=posterior.attrs["n_robots"],
             n_missions=posterior.attrs["n_missions"],
             is_drawn=is_drawn,
         )
-        ahead = parameters | robots
-        params = assemble_params(ahead, x0, memory)
-        params = params._replace(**maps)  # pyright: ignore
-        if is_drawn and places is not None:
-            own = robots_in_bounds_of(places, parameters, names[0])
-            params = params._replace(place_robot=own)
-        found.append(params.in_order(*names))
+        found.append(({**parameters, **robots}, maps | of_robots if is_drawn else maps))
     return found
 
 
-def _effects_of_robots(model: TrustModel) -> list[Effect]:
-    """Return the effects of a model that act on robots, not on places."""
-    return [effect for effect in model.effects if not isinstance(effect, PlaceEffect)]
+def _effects_of_robots(effects: Sequence[Effect]) -> list[Effect]:
+    """Return the effects that act on robots, not on places."""
+    return [effect for effect in effects if not isinstance(effect, PlaceEffect)]
 
 
 def _robot_effects_ahead(
@@ -330,9 +357,8 @@ def _in_order(
         dims = json.loads(posterior["posterior"].attrs.get("dims", "{}"))
         for dim in {dim for of_variable in dims.values() for dim in of_variable}:
             names |= _names_along(posterior, dim, robots, features)
-    else:
-        for effect in effects_of(posterior):
-            names |= effect.coords
+    for effect in effects_of(posterior):
+        names |= effect.coords
 
     for axis, of_axis in {"robot": robots, "feature": features}.items():
         if of_axis:
@@ -422,7 +448,9 @@ def is_by_position(posterior: xr.DataTree) -> bool:
 
 
 def effects_of(posterior: xr.DataTree) -> tuple[Effect, ...]:
-    """Return the effects in the model of a posterior; a function has none."""
+    """Return the effects in the model of a posterior."""
+    if is_by_position(posterior):
+        return effects_from_record({"effects": json.loads(posterior.attrs["effects"])})
     return effects_from_record(json.loads(posterior.attrs["model_record"]))
 
 
@@ -540,17 +568,33 @@ def sample_prior_ahead(model: TrustModel, workspace: Workspace, n_draws: int, se
         n_draws: Number of draws.
         seed: Random seed; the same seed gives the same draws.
     """
-    features = workspace.features
-    n_robots = workspace.team.n_robots
     rng = np.random.default_rng(seed)
 
-    prior = _prior(model, len(features), n_robots)
+    prior = _prior(model, len(workspace.features), workspace.team.n_robots)
     parameters = prior_parameters(prior, n_draws, rng)
     drawn = model.scores(prior.observations).draw(n_draws, rng)
     parameters |= {name: drawn[name] for effect in model.effects for name in effect.names}
 
+    theta = model.derived(parameters)
+    values, places = with_prior_effects_ahead(workspace, model.effects, theta, parameters, seed)
+    return assemble_params(values, model.x0, model.memory)._replace(**places)  # pyright: ignore
+
+
+def with_prior_effects_ahead(
+    workspace: Workspace,
+    effects: Sequence[Effect],
+    theta: Theta,
+    parameters: Mapping[str, np.ndarray],
+    seed: int,
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return parameters with the effects of the first mission from the prior; see `with_effects`.
+
+    `theta` and `parameters` contain draws (draw, ...) from the prior by name.
+    """
+    n_robots = workspace.team.n_robots
+    n_draws = len(theta["inverse_gain"])
     maps: dict[str, Any] = {}
-    if any(isinstance(effect, PlaceEffect) for effect in model.effects):
+    if any(isinstance(effect, PlaceEffect) for effect in effects):
         nowhere = {
             "place": np.zeros((1, n_draws, 0)),
             "place_bound": np.zeros((1, n_draws, 0)),
@@ -565,16 +609,15 @@ def sample_prior_ahead(model: TrustModel, workspace: Workspace, n_draws: int, se
 
     never = {"robot_effect": np.zeros((n_draws, 0, n_robots))}
     robots = _robot_effects_ahead(
-        dict.fromkeys(_effects_of_robots(model), never),
-        model.derived(parameters),
+        dict.fromkeys(_effects_of_robots(effects), never),
+        theta,
         parameters,
-        features=features,
+        features=workspace.features,
         n_robots=n_robots,
         n_missions=0,
         is_drawn=True,
     )
-    params = assemble_params(parameters | robots, model.x0, model.memory)
-    return params._replace(**maps)  # pyright: ignore
+    return {**parameters, **robots}, maps
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:

@@ -41,11 +41,16 @@ from trustbo.inference.importance import (
 )
 from trustbo.inference.nuts import sample_by_nuts
 from trustbo.inference.place_maps import place_group
-from trustbo.inference.tree import N_PRIOR, in_label_order, to_datatree, with_latent
+from trustbo.inference.tree import (
+    N_PRIOR,
+    default_draws,
+    in_label_order,
+    to_datatree,
+    with_latent,
+)
 from trustbo.inference.variables import draws_of, prior_parameters, to_variables
 from trustbo.models.backend import library_attrs
 from trustbo.models.default import default_model
-from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_to_record
@@ -62,10 +67,6 @@ from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
 """Names of the samplers of `fit`."""
-_N_DRAWS = 1000
-"""Number of posterior draws per chain."""
-_N_PLACE_DRAWS = 250
-"""Number of draws per chain from the importance sampler with place effects."""
 _CORRECTED = 2
 """Number of draws for which the EP density is corrected, per point of a round."""
 _SIZE = 256
@@ -164,8 +165,6 @@ def fit(
         scale = missions[0].scale  # empty unless the missions are people's reports
         model = HumanTrust(scale=scale) if scale else default_model(places=has_places(missions))
     draws, chains, warmup = require_numbers_of_draws(draws, chains, warmup)
-    if draws is None:
-        draws = _default_draws(model, sampler)
     seed = require_whole("seed", seed, 0)
     if all(np.isnan(mission.contact_rate).all() for mission in missions):
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
@@ -176,6 +175,8 @@ def fit(
         trust_model: TrustModel = require_kind("model", model, TrustModel, remedy)
         require_poolable_with_model(trust_model, earlier, robots)
         sampler = SAMPLERS[0] if sampler is None else require_choice("sampler", sampler, SAMPLERS)
+        if draws is None:
+            draws = default_draws(trust_model.effects, sampler)
         tree, complaints, add_latent = _fit_model(
             missions, trust_model, sampler, workspace, draws, chains, warmup, seed, progress, start
         )
@@ -230,16 +231,6 @@ def _same_names(start: xr.DataTree | None, mission: Mission) -> xr.DataTree | No
     same_robots = names_in(start, "robot") in ((), mission.robots)
     same_features = names_in(start, "feature") in ((), mission.features)
     return start if same_robots and same_features else None
-
-
-def _default_draws(model: TrustModel | Callable[..., Any], sampler: str | None) -> int:
-    """Return the default number of draws per chain; see `fit`."""
-    if sampler == "nuts" or not isinstance(model, TrustModel):
-        return _N_DRAWS
-
-    # Importance draws are independent, so fewer are needed than from a Markov chain.
-    has_places = any(isinstance(effect, PlaceEffect) for effect in model.effects)
-    return _N_PLACE_DRAWS if has_places else _N_DRAWS
 
 
 def require_numbers_of_draws(

@@ -28,6 +28,7 @@ from trustbo.inference.functions.draws import FunctionDraws
 from trustbo.inference.functions.fit import (
     draws_of_function,
     prior_draws_of_function,
+    prior_draws_of_function_ahead,
     require_learnable,
     require_plannable,
     require_poolable_with_function,
@@ -286,14 +287,14 @@ class FunctionLearner:
         self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False
     ) -> Draws:
         """See `Learner.draws`; variables of single missions are always drawn for the next one."""
-        return draws_of_function(self.model, posterior, workspace)
+        return draws_of_function(self.model, posterior, workspace, [next_mission])[0]
 
     def expected_and_drawn(
         self, posterior: xr.DataTree, workspace: Workspace | None
     ) -> tuple[Draws, Draws]:
         """See `Learner.expected_and_drawn`."""
-        draws = self.draws(posterior, workspace)
-        return draws, draws
+        expected, drawn = draws_of_function(self.model, posterior, workspace, [False, True])
+        return expected, drawn
 
     def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> FunctionDraws:
         """See `Learner.prior_draws`."""
@@ -301,7 +302,7 @@ class FunctionLearner:
 
     def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> FunctionDraws:
         """See `Learner.prior_draws_ahead`; the variables of single missions are always drawn."""
-        return self.prior_draws(n_draws, seed, workspace)
+        return prior_draws_of_function_ahead(self.model, n_draws, seed, workspace)
 
     def prior_mean(self, workspace: Workspace) -> Draws:
         """See `Learner.prior_mean`."""

@@ -17,6 +17,7 @@ from trustbo.inference.draws import (
 from trustbo.inference.latent import Latent, latent_of, replicate
 from trustbo.inference.variables import prior_parameters, with_prior_effects
 from trustbo.models.effects.effect import Effect
+from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.observations import Observations
 from trustbo.models.scores import log_density
 from trustbo.streams import stream
@@ -29,6 +30,10 @@ RATES = "contact_rate"
 """Value of this attribute for log densities of rates; also the name of the rates."""
 _OF_RATES = ("mission", "bound", "robot")
 _DIMS = dict.fromkeys(("trust", "trust_mean", "trust_sd", "contact_rate"), _OF_RATES)
+_N_DRAWS = 1000
+"""Number of posterior draws per chain."""
+_N_PLACE_DRAWS = 250
+"""Number of draws per chain from importance sampling with place effects."""
 _N_TRAJECTORIES = 200
 """Number of kept draws of latent trust and predicted rates, evenly spaced in the chains."""
 N_PRIOR = 500
@@ -41,6 +46,13 @@ the axes of a variable occur first in other variables, in a different order.
 """
 _KEPT = ("posterior", "sample_stats", "prior", "hazard")
 """Groups kept by `parameters_alone`, besides those of the effects."""
+
+
+def default_draws(effects: Sequence[Effect], sampler: str) -> int:
+    """Return the default number of draws per chain; see `fit`."""
+    has_places = any(isinstance(effect, PlaceEffect) for effect in effects)
+    # Importance draws are independent, so fewer are needed than from a Markov chain.
+    return _N_PLACE_DRAWS if has_places and sampler != "nuts" else _N_DRAWS
 
 
 def to_datatree(

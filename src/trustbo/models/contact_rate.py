@@ -1,5 +1,6 @@
 """The state-space model as a NumPyro distribution, for built-in and custom models."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import jax
@@ -10,7 +11,9 @@ from jax import Array, lax, random
 from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
-from trustbo.errors import OldName, TrustboError
+from trustbo.display import joined
+from trustbo.errors import OldName, TrustboError, require_list
+from trustbo.models.effects.effect import Effect, SampledEffect
 from trustbo.models.observations import median_resolution
 from trustbo.statespace import Inputs, StateSpace, kalman
 from trustbo.statespace.form import coupled_robots, independent_robots
@@ -63,8 +66,8 @@ class ContactRate(dist.Distribution):
     """
 
     support = constraints.independent(constraints.real, 2)  # pyright: ignore
-    pytree_data_fields = ("inputs", "n_ticks", "space")
-    pytree_aux_fields = ("adds_resolution",)
+    pytree_data_fields = ("inputs", "n_ticks", "space", "theta")
+    pytree_aux_fields = ("adds_resolution", "effects")
 
     @jax.numpy_rank_promotion("allow")
     def __init__(
@@ -79,6 +82,7 @@ class ContactRate(dist.Distribution):
         offset: ArrayLike = 0.0,
         delta_s: ArrayLike | None = None,
         n_ticks: ArrayLike | None = None,
+        effects: Sequence[SampledEffect] = (),
     ) -> None:
         """Set the inputs of bounds and the parameters.
 
@@ -103,9 +107,13 @@ class ContactRate(dist.Distribution):
                 perfectly, for example if all are 1. If every measured rate has a tick count,
                 `log_prob` refers to the tick counts, like the log-likelihoods of `fit`; otherwise,
                 it is the log density of the rates.
+            effects: Effects that are added to the drift, such as `[PlaceEffect().sample(),
+                RobotEffect().sample()]`. `fit` integrates them out, and then draws them. As they
+                belong to several missions, `log_prob` is not defined.
 
         Raises:
-            TrustboError: If the drift or a parameter has the wrong shape.
+            TrustboError: If the drift or a parameter has the wrong shape; or if there are effects,
+                and an offset, or a matrix as beta0 or noise.
         """
         u = jnp.asarray(drift, float)
         if u.ndim != 3:
@@ -148,6 +156,10 @@ class ContactRate(dist.Distribution):
         self._set(space, Inputs(u, offset), n_ticks)
         self.adds_resolution = n_ticks is not None
         self.noises = delta_w, delta_v
+        if effects:
+            if not (isinstance(offset, int | float) and offset == 0):
+                raise TrustboError("effects cannot be combined with an offset; leave one out.")
+            self.effects, self.theta = _read_effects(effects, values)
 
     of = OldName("from_space")
 
@@ -178,6 +190,8 @@ class ContactRate(dist.Distribution):
         self.space = space
         self.adds_resolution = False
         self.noises: tuple[Any, ...] = ()  # arguments delta_w and delta_v, where they are known
+        self.effects: tuple[Effect, ...] = ()
+        self.theta: dict[str, Any] = {}  # hyperparameters of the effects; see `effects.Theta`
         dist.Distribution.__init__(self, shape[:1], shape[1:])
 
     @property
@@ -186,6 +200,13 @@ class ContactRate(dist.Distribution):
         if not self.adds_resolution:
             return self.space
         return self.space.with_noise(median_resolution(self.n_ticks))
+
+    def given(self, effects: ArrayLike) -> "ContactRate":
+        """Return the distribution given the effects on the drift (mission, bound, robot)."""
+        drift, offset = self.inputs
+        inputs = Inputs(drift + jnp.reshape(jnp.asarray(effects), drift.shape), offset)
+        flat = Inputs(*(value.reshape(*value.shape[:2], -1) for value in inputs))
+        return ContactRate.from_space(self.form, flat, self.n_ticks)
 
     def log_resolution(self, value: Array) -> Array:
         """Compute the log ratio (mission,) of the probability of tick counts to a density.
@@ -207,8 +228,14 @@ class ContactRate(dist.Distribution):
 
         With `n_ticks`, it is the log probability of the tick counts.
 
-        Raises TrustboError unless `value` has the shape (mission, bound, robot) of the drift.
+        Raises TrustboError if there are effects, or unless `value` has the shape (mission, bound,
+        robot) of the drift.
         """
+        if self.effects:
+            raise TrustboError(
+                "a ContactRate with effects has no density of single missions; fit the function "
+                "with trustbo.fit, which integrates the effects out."
+            )
         drift, offset = self.inputs
         n_missions, n_bounds, n_groups, n_members = drift.shape
         shape = n_missions, n_bounds, n_groups * n_members
@@ -262,6 +289,28 @@ class ContactRate(dist.Distribution):
 
         drawn = jnp.moveaxis(rates, 0, -3)
         return drawn.reshape(*sample_shape, *self.batch_shape, *self.event_shape)
+
+
+def _read_effects(
+    effects: Sequence[SampledEffect], values: Mapping[str, Array]
+) -> tuple[tuple[Effect, ...], dict[str, Any]]:
+    """Return effects and their hyperparameters by name, with `inverse_gain`; see `Theta`."""
+    remedy = "give objects like PlaceEffect().sample()"
+    given = require_list("effects", effects, SampledEffect, remedy)
+    kinds = [type(one.effect).__name__ for one in given]
+    if len(set(kinds)) < len(kinds):
+        raise TrustboError(f"effects must be of different classes; got {joined(kinds)}.")
+
+    matrices = [name for name, value in values.items() if value.ndim == 2]
+    if matrices:
+        raise TrustboError(
+            f"effects need a {matrices[0]} of the shape () or (robot,); got a matrix."
+        )
+
+    inverse_gain = 1.0 - values["beta0"]
+    theta = {name: value for one in given for name, value in one.values.items()}
+    theta["inverse_gain"] = inverse_gain[0] if inverse_gain.shape == (1,) else inverse_gain
+    return tuple(one.effect for one in given), theta
 
 
 def _checked(name: str, value: ArrayLike, n_robots: int, may_be_matrix: bool) -> Array:

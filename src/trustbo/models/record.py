@@ -16,15 +16,19 @@ def model_to_record(model: TrustModel) -> dict[str, Any]:
 
     The entry `by_feature` is true if the priors depend on the feature names.
     """
-    effects: Any = model.effects
     record = {
         "class": type(model).__name__,
         **model.options(),
         "priors": model.priors.describe(),
-        "effects": [{"kind": type(effect).__name__, **asdict(effect)} for effect in effects],
+        "effects": effects_to_record(model.effects),
         "by_feature": model.priors is Priors.default(model.family),
     }
     return json.loads(json.dumps(record))  # tuples become lists, as in a file
+
+
+def effects_to_record(effects: Sequence[Any]) -> list[dict[str, Any]]:
+    """Convert effects to dicts of their class and settings."""
+    return [{"kind": type(effect).__name__, **asdict(effect)} for effect in effects]
 
 
 def model_from_record(

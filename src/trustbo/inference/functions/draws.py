@@ -18,6 +18,7 @@ from trustbo.inference.functions.data import (
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.models.backend import own_settings
 from trustbo.models.draws import Draws
+from trustbo.models.params import Params, assemble_params
 from trustbo.statespace import Inputs, StateSpace
 
 _NUMBERS = 4_000_000
@@ -42,6 +43,8 @@ class FunctionDraws(Draws):
         features: Names of the features.
         shape: Number of rows and columns of the map; None without a map.
         resolution: Resolution of the rates of the fit, if the function adds it to its noise.
+        effects: Effects that are added to the drift, as parameters without other weights; None if
+            there are none.
     """
 
     __slots__ = (
@@ -49,6 +52,7 @@ class FunctionDraws(Draws):
         "_is_flat",
         "_numbers",
         "_of_mean",
+        "effects",
         "features",
         "model",
         "resolution",
@@ -73,6 +77,7 @@ class FunctionDraws(Draws):
         self.features = tuple(features)
         self.shape = shape
         self.resolution = resolution
+        self.effects: Params | None = None
         self._numbers = np.arange(len(next(iter(self.values.values()))))  # of the random keys
         self._of_mean = False
         self._is_flat = True  # whether a mean has a leading axis
@@ -114,6 +119,8 @@ class FunctionDraws(Draws):
     @property
     def grid_shape(self) -> tuple[int, int] | None:
         """See `Draws.grid_shape`."""
+        if self.effects is not None and self.effects.grid_shape:
+            return self.effects.grid_shape
         depends = {"cell", "bound"} & {*self.model.inputs}
         return self.shape if depends else None
 
@@ -132,14 +139,30 @@ class FunctionDraws(Draws):
     def _space(self) -> StateSpace:
         """State-space form of each draw or of the mean; it is the same for all bounds."""
         if self._form is None:
-            nothing = np.zeros((1, self.n_robots, self.n_features))
-            data = self._data(nothing, np.full((1, 3), -1))
-            space, _ = self._run(self._flat_values(), np.atleast_1d(self._numbers), data)
+            space, _ = self._run(self._flat_values(), np.atleast_1d(self._numbers), self.nothing())
             if self._of_mean:
                 fields = [None if f is None else f.mean(0, keepdims=True) for f in space]
                 space = StateSpace(*fields)
             self._form = space.with_noise(self.resolution)
         return self._form
+
+    def nothing(self) -> dict[str, Any]:
+        """Return the inputs of a mission with one bound, and without awareness of it."""
+        return self._data(np.zeros((1, self.n_robots, self.n_features)), np.full((1, 3), -1))
+
+    def theta(self) -> dict[str, np.ndarray]:
+        """Return the hyperparameters (draw, ...) of the effects; see `models.effects.Theta`."""
+        return self.model.over_draws("theta", 2, self.nothing())(self.values, _keys(self._numbers))
+
+    def adding(
+        self, parameters: Mapping[str, np.ndarray], places: Mapping[str, Any]
+    ) -> "FunctionDraws":
+        """Return the draws with effects; for the arguments, see `inference.draws.with_effects`."""
+        other = copy(self)
+        x0 = {"x0_mean": 0.0, "x0_sd": 0.0}
+        effects = assemble_params(parameters, x0)._replace(**places)  # pyright: ignore
+        other.effects = effects.in_order(self.robots, self.features)
+        return other
 
     def require_valid(self, n_robots: int | None = None, n_features: int | None = None) -> None:
         """See `Draws.require_valid`; the values of a posterior are always valid."""
@@ -169,7 +192,10 @@ class FunctionDraws(Draws):
         known = ~np.isnan(z).any((1, 2))
         drift = np.full((*self.leading, self.n_robots, len(z)), np.nan)
         drift[..., known] = self._drift(z[known], bounds[known])
-        return drift.reshape(*self.leading, self.n_robots, *shape)
+        drift = drift.reshape(*self.leading, self.n_robots, *shape)
+        if self.effects is None:
+            return drift
+        return drift + self.effects.inputs(awareness, bounds if len(shape) == 1 else None)
 
     def _drift(self, z: np.ndarray, bounds: np.ndarray) -> np.ndarray:
         """Compute the drift (..., robot, bound); `z` has the shape (bound, robot, feature)."""
@@ -196,9 +222,7 @@ class FunctionDraws(Draws):
         self, values: dict[str, np.ndarray], numbers: np.ndarray, data: Data
     ) -> tuple[StateSpace, Inputs]:
         """Run the function; return the form (draw, group, member) and the inputs."""
-        with own_settings():
-            keys = jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(_SEED), numbers)
-        space, inputs = self.model.over_draws("form", 2, data)(values, keys)
+        space, inputs = self.model.over_draws("form", 2, data)(values, _keys(numbers))
 
         if inputs.drift.shape[1:3] != data["awareness"].shape[:2]:
             raise TrustboError(self._wrong_size())
@@ -311,6 +335,8 @@ class FunctionDraws(Draws):
 
         other = copy(self)
         other._is_flat = np.ndim(index) > 0  # the mean is the only draw
+        if self.effects is not None:
+            other.effects = self.effects.draw(index)
         return other
 
     def _some(self, index: Any) -> "FunctionDraws":
@@ -320,6 +346,8 @@ class FunctionDraws(Draws):
         other._numbers = self._numbers[index]
         other._of_mean = False
         other._form = None
+        if self.effects is not None:
+            other.effects = self.effects.draw(index)
         return other
 
     def mean(self) -> "FunctionDraws":
@@ -329,6 +357,8 @@ class FunctionDraws(Draws):
             other._of_mean = True
             other._form = None
         other._is_flat = False
+        if other.effects is not None:
+            other.effects = other.effects.mean()
         return other
 
     def flat(self) -> "FunctionDraws":
@@ -337,11 +367,27 @@ class FunctionDraws(Draws):
         other.values = self._flat_values()
         other._numbers = np.atleast_1d(self._numbers)
         other._is_flat = True
+        if self.effects is not None:
+            other.effects = self.effects.flat()
         return other
 
     def record(self) -> dict[str, Any]:
         """See `Draws.record`."""
         return {name: np.asarray(values).tolist() for name, values in self.values.items()}
+
+
+def no_weights(theta: Mapping[str, np.ndarray], features: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return parameters (draw, ...) of a model class whose trust consists of effects alone."""
+    zeros = np.zeros(len(theta["inverse_gain"]))
+    weights = np.zeros((len(zeros), len(features)))
+    none = {name: zeros for name in ("beta0", "b", "delta_w", "delta_v")}
+    return {**theta, **none, "beta": weights}
+
+
+def _keys(numbers: np.ndarray) -> Any:
+    """Return the random keys of draws, given by number."""
+    with own_settings():
+        return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(_SEED), numbers)
 
 
 def _by_robot(inputs: Inputs) -> np.ndarray:

@@ -10,9 +10,18 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, require_kind
-from trustbo.inference.draws import in_order_of, joined_draws, names_in
+from trustbo.inference.draws import (
+    effects_of,
+    in_order_of,
+    joined_draws,
+    names_in,
+    values_of,
+    with_effects,
+    with_prior_effects_ahead,
+)
 from trustbo.inference.functions.checks import require_fittable, require_unpadded_results
 from trustbo.inference.functions.data import (
+    RATES,
     Data,
     arrays_of,
     data_of,
@@ -20,16 +29,19 @@ from trustbo.inference.functions.data import (
     data_of_example,
     observations_of,
 )
-from trustbo.inference.functions.draws import N_CHECKED, FunctionDraws
-from trustbo.inference.functions.function import Found, FunctionModel
+from trustbo.inference.functions.draws import N_CHECKED, FunctionDraws, no_weights
+from trustbo.inference.functions.effects import AddedEffects
+from trustbo.inference.functions.function import EFFECTS, Found, FunctionModel
 from trustbo.inference.functions.nuts import require_gradient
-from trustbo.inference.functions.sampling import Drawn, keys_of, sampled, targets_of
+from trustbo.inference.functions.sampling import NUTS, Drawn, keys_of, sampled, targets_of
 from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.latent import Latent
-from trustbo.inference.tree import N_PRIOR, add_groups, kept_draws, to_datatree
+from trustbo.inference.place_maps import place_group
+from trustbo.inference.tree import N_PRIOR, add_groups, default_draws, kept_draws, to_datatree
 from trustbo.models.backend import library_attrs
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
+from trustbo.models.record import effects_to_record
 from trustbo.stacking import require_same_robots
 from trustbo.statespace import kalman
 from trustbo.statespace.form import Inputs, StateSpace
@@ -53,7 +65,7 @@ def fit_function(
     model: FunctionModel,
     workspace: Workspace | None,
     sampler: str,
-    draws: int,
+    draws: int | None,
     chains: int,
     warmup: int | None,
     seed: int,
@@ -75,10 +87,17 @@ def fit_function(
     if workspace is not None:
         require_plannable(model, workspace)
     require_fittable(model, data, sites, [len(mission.bounds) for mission in missions])
+    resolution = model.resolution(data)
+    of_counts = resolution > 0.0
+    effects = _effects_in(model, data, observations, missions, workspace, of_counts=of_counts)
+    if effects is not None:
+        require_integrable(model, sampler)
+    if draws is None:
+        draws = default_draws(effects.effects if effects else (), sampler)
 
     prior = model.over_draws("prior", 1, data)(keys_of(N_PRIOR, seed + _OF_PRIOR))
     drawn = sampled(
-        targets_of(model, data, sites),
+        targets_of(model, data, sites, effects),
         prior,
         start,
         sampler,
@@ -90,13 +109,13 @@ def fit_function(
         check=check,
     )
 
-    resolution = model.resolution(data)
     if drawn.complaints and not resolution and _all_equal(observations):
         drawn.complaints.append(_UNBOUNDED)
-    tree = _tree(model, drawn, prior, sites, missions, data)
+    tree = _tree(model, drawn, prior, sites, missions, data, effects, seed)
     tree.attrs |= {
         "model": model.name,
         "model_record": model.text,
+        "effects": json.dumps(effects_to_record(effects.effects if effects else ())),
         "family": model.family,
         "n_robots": observations.n_robots,
         "n_missions": len(missions),
@@ -108,6 +127,31 @@ def fit_function(
         **library_attrs(drawn.attrs["sampler"]),
     }
     return tree, drawn.complaints
+
+
+def require_integrable(model: FunctionModel, sampler: str) -> None:
+    """Raise TrustboError if a sampler does not integrate the effects of a function out."""
+    if sampler == NUTS:
+        raise TrustboError(
+            f"{model.in_short()} has effects, which only importance sampling integrates out; use "
+            'sampler="auto".'
+        )
+
+
+def _effects_in(
+    model: FunctionModel,
+    data: Data,
+    observations: Observations,
+    missions: Sequence[Mission],
+    workspace: Workspace | None = None,
+    *,
+    of_counts: bool = False,
+) -> AddedEffects | None:
+    """Return the effects of a function in missions, or None if it has none; see `AddedEffects`."""
+    effects = model.effects(data)
+    if not effects:
+        return None
+    return AddedEffects(effects, observations, missions, workspace, of_counts=of_counts)
 
 
 def _all_equal(observations: Observations) -> bool:
@@ -127,6 +171,7 @@ def with_latent_of_function(
     observations = Observations.from_missions(missions)
     data = _data_for(model, missions, observations)
     sites = model.sites(data)
+    effects = _effects_in(model, data, observations, missions)
     sizes = posterior["posterior"].sizes
     n_draws = sizes["chain"] * sizes["draw"]
     n_missions = len(missions)
@@ -144,7 +189,7 @@ def with_latent_of_function(
     trust = np.empty((len(some), *shape))
     predicted = np.empty((len(some), *shape))
     with slow_bar("latent trust", " draws", progress, total=n_draws) as bar:
-        for where, found in _evaluated(model, posterior, data, np.arange(n_draws)):
+        for where, found in _evaluated(model, posterior, data, effects, np.arange(n_draws)):
             of_counts = bool(found.of_counts.all())
             log_likelihood[where] = found.log_likelihood[:, :n_missions]
             for name, of_site in found.log_prior.items():
@@ -165,7 +210,7 @@ def with_latent_of_function(
 
     sd = np.sqrt(np.maximum(square - mean**2, 0.0))
     latent = Latent(trust, mean, sd, log_likelihood, predicted)
-    replicated = _prior_predictive(model, data, observations, seed)
+    replicated = _prior_predictive(model, data, observations, effects, seed)
     if "prior" in posterior.children:  # some of its draws may have been selected
         replicated = replicated[posterior["prior"].to_dataset()["draw"].values]
     densities = {name: np.concatenate(parts) for name, parts in log_prior.items()}
@@ -188,9 +233,10 @@ def log_likelihood_of_function(
     sizes = posterior["posterior"].sizes
     n_draws = sizes["chain"] * sizes["draw"]
 
+    effects = _effects_in(model, data, observations, missions)
     of_counts = True
     log_likelihood = np.empty((n_draws, len(missions)))
-    for where, found in _evaluated(model, posterior, data, np.arange(n_draws)):
+    for where, found in _evaluated(model, posterior, data, effects, np.arange(n_draws)):
         of_counts = bool(found.of_counts.all())
         log_likelihood[where] = found.log_likelihood[:, : len(missions)]
     return log_likelihood, of_counts and _all_counted(observations)
@@ -207,25 +253,42 @@ def forms_of_function(
     """
     observations = Observations.from_missions(missions)
     data = _data_for(model, missions, observations)
+    effects = _effects_in(model, data, observations, missions)
     n_missions, n_bounds = observations.contact_rate.shape[:2]
-    for _, found in _evaluated(model, posterior, data, some):
+    for _, found in _evaluated(model, posterior, data, effects, some):
         space, inputs = _form_of(found, n_missions, n_bounds)
         yield space, inputs, bool(found.of_counts.all()) and _all_counted(observations)
 
 
 def _evaluated(
-    model: FunctionModel, posterior: xr.DataTree, data: Data, some: np.ndarray
+    model: FunctionModel,
+    posterior: xr.DataTree,
+    data: Data,
+    effects: AddedEffects | None,
+    some: np.ndarray,
 ) -> Iterator[tuple[np.ndarray, Found]]:
     """Run a function with some draws of its posterior; yield chunks of indices with their results.
 
-    The random key of a draw does not depend on which other draws are chosen.
+    The random key of a draw does not depend on which other draws are chosen. The results include
+    the effects.
     """
     values = _padded_values(posterior, model.sites(data))
     keys = keys_of(len(next(iter(values.values()))), posterior.attrs["seed"])
+    if effects is not None:
+        theta = model.over_draws("theta", 2, data)(values, keys)
+        of_effects = {effect.group: values_of(posterior, effect) for effect in effects.effects}
+        values[EFFECTS] = _padded(effects.sum_of(of_effects, theta), data)
     evaluate = model.over_draws("evaluate", 2, data)
     for begin in range(0, len(some), _SIZE):
         where = some[begin : begin + _SIZE]
         yield where, evaluate({name: v[where] for name, v in values.items()}, keys[where])
+
+
+def _padded(values: np.ndarray, data: Data) -> np.ndarray:
+    """Pad values (draw, mission, bound, robot) with zeros to the missions and bounds of data."""
+    shape = data[RATES].shape
+    missing = [(0, n - own) for n, own in zip(shape, values.shape[1:], strict=True)]
+    return np.pad(values, [(0, 0), *missing])
 
 
 def _all_counted(observations: Observations) -> bool:
@@ -236,9 +299,19 @@ def _all_counted(observations: Observations) -> bool:
 
 
 def draws_of_function(
-    model: FunctionModel, posterior: xr.DataTree, workspace: Workspace | None
-) -> FunctionDraws:
+    model: FunctionModel,
+    posterior: xr.DataTree,
+    workspace: Workspace | None,
+    next_mission: Sequence[bool],
+) -> list[FunctionDraws]:
     """Return the draws of a posterior of a function, for the bounds of a workspace.
+
+    Args:
+        model: The function.
+        posterior: Its posterior.
+        workspace: The workspace, or None.
+        next_mission: For each result, whether the effects of the next mission are drawn at random;
+            see `params_of`.
 
     Raises:
         TrustboError: If the workspace has different robots or features, or the same in a different
@@ -271,13 +344,22 @@ def draws_of_function(
             "of masking them."
         )
     resolution = float(posterior.attrs["resolution"])
-    return FunctionDraws(model, values, robots, features, shape, resolution)
+    draws = FunctionDraws(model, values, robots, features, shape, resolution)
+    effects = effects_of(posterior)
+    if not effects:
+        return [draws] * len(next_mission)
+
+    theta = draws.theta()
+    found = with_effects(
+        posterior, effects, theta, no_weights(theta, features), robots, next_mission
+    )
+    return [draws.adding(*one) for one in found]
 
 
 def prior_draws_of_function(
     model: FunctionModel, n_draws: int, seed: int, workspace: Workspace
 ) -> FunctionDraws:
-    """Draw the variables of a function from the prior, for the bounds of a workspace."""
+    """Draw the variables of a function from the prior, without effects, for a workspace."""
     awareness = workspace.awareness.values
     n_robots, _, rows, cols, _ = awareness.shape
     features = tuple(workspace.features)
@@ -289,6 +371,20 @@ def prior_draws_of_function(
     if not values:
         raise TrustboError(f"{model.in_short()} has no variable that is common to all missions.")
     return FunctionDraws(model, values, workspace.team.names, features, (rows, cols))
+
+
+def prior_draws_of_function_ahead(
+    model: FunctionModel, n_draws: int, seed: int, workspace: Workspace
+) -> FunctionDraws:
+    """Draw the variables of a function from the prior, with the effects of the first mission."""
+    draws = prior_draws_of_function(model, n_draws, seed, workspace)
+    effects = model.effects(draws.nothing())
+    if not effects:
+        return draws
+
+    theta = draws.theta()
+    parameters = no_weights(theta, workspace.features)
+    return draws.adding(*with_prior_effects_ahead(workspace, effects, theta, parameters, seed))
 
 
 def require_plannable(model: FunctionModel, workspace: Workspace) -> None:
@@ -311,6 +407,8 @@ def require_learnable(model: FunctionModel, workspace: Workspace, *, by_gradient
         data["observations"] = observations_of(data)
     sites = model.sites(data)
     if by_gradient:
+        if model.effects(data):
+            require_integrable(model, NUTS)
         require_gradient(model, targets_of(model, data, sites)[0].coordinates, data)
     if not model.needs_observations:  # its data are not padded
         require_unpadded_results(model, data, sites, [len(known)])
@@ -420,11 +518,19 @@ def _replicated(
 
 
 def _prior_predictive(
-    model: FunctionModel, data: Data, observations: Observations, seed: int
+    model: FunctionModel,
+    data: Data,
+    observations: Observations,
+    effects: AddedEffects | None,
+    seed: int,
 ) -> np.ndarray:
     """Draw rates (draw, mission, bound, robot) of the missions from the prior."""
     keys = keys_of(N_PRIOR, seed + _OF_PRIOR)
-    values = model.over_draws("prior", 1, data)(keys)
+    values = dict(model.over_draws("prior", 1, data)(keys))
+    if effects is not None:
+        theta = model.over_draws("theta", 2, data)(values, keys)
+        drawn = effects.sum_of_prior(theta, stream(seed, "prior effects"))
+        values[EFFECTS] = _padded(drawn, data)
     found: Found = model.over_draws("evaluate", 2, data)(values, keys)
     n_missions, n_bounds = observations.contact_rate.shape[:2]
     space, inputs = _form_of(found, n_missions, n_bounds)
@@ -439,6 +545,8 @@ def _tree(
     sites: Mapping[str, Site],
     missions: Sequence[Mission],
     data: Data,
+    effects: AddedEffects | None,
+    seed: int,
 ) -> xr.DataTree:
     """Build a DataTree from draws of the posterior, draws (draw, ...) of the prior, and data.
 
@@ -467,7 +575,18 @@ def _tree(
         for name, site in stored.items()
         for own, dim, n in zip(dims[safe(name)], site.dims, shapes[name], strict=True)
     }
-    tree = to_datatree(groups, missions, dims, labels=labels)
+    of_effects = {
+        group: {
+            name: v.reshape(*drawn.statistics["lp"].shape, *v.shape[1:]) for name, v in own.items()
+        }
+        for group, own in (drawn.effects or {}).items()
+    }
+    places = of_effects.pop("places", None)  # has its own axes
+    added = effects.effects if effects else ()
+    tree = to_datatree(groups | of_effects, missions, dims, added, labels=labels)
+    if places is not None and effects is not None:
+        at: Any = effects.observations.visited
+        tree["places"] = xr.DataTree(place_group(places, at, missions[0].robots, seed))
     common = [name for name, site in sites.items() if site.mission_axis is None]
     tree["posterior"].attrs["common"] = json.dumps(common)
     tree["posterior"].attrs["dims"] = json.dumps(dims)

@@ -44,10 +44,13 @@ from trustbo.inference.functions.sites import (
 )
 from trustbo.models.backend import own_settings
 from trustbo.models.contact_rate import ContactRate
+from trustbo.models.effects.effect import Effect
 from trustbo.models.observations import median_resolution
 from trustbo.models.scores import NOISES
 from trustbo.statespace import Inputs, StateSpace
 
+EFFECTS = "effects on the drift"
+"""Name of the sum of the effects among the values of `FunctionModel.evaluate`."""
 KIND = "function"
 """Value of the entry `class` in the record of a model that is a function."""
 _HOW = (
@@ -73,6 +76,17 @@ class Found(NamedTuple):
     """Log density of each mission's rates, or log probability of its counts, shape (mission,)."""
     of_counts: Any
     """Whether `log_likelihood` refers to tick counts if every rate has one."""
+
+
+class Outer(NamedTuple):
+    """Results of a function whose effects are to be integrated out, for one draw."""
+
+    log_p: Any
+    """Log density of all sites but the contact rates, shape ()."""
+    space: StateSpace
+    inputs: Inputs
+    theta: dict[str, Any]
+    """Hyperparameters of the effects; see `models.effects.Theta`."""
 
 
 class Probe(NamedTuple):
@@ -195,6 +209,11 @@ class FunctionModel:
         is_plain = all(site.mission_axis is None for site in sites)
         is_plain = is_plain and all(isinstance(one, ExpTransform) for one in maps)
         return (names[0], names[1]) if is_plain else None
+
+    def effects(self, data: Data) -> tuple[Effect, ...]:
+        """Return the effects that the function adds to the drift."""
+        trace, _ = self._shapes(data)
+        return trace[RATES]["fn"].effects
 
     def resolution(self, data: Data) -> float:
         """Return the resolution of rates that the function adds to its noise, or 0."""
@@ -432,6 +451,13 @@ class FunctionModel:
         log_p, _ = log_density(self._at(z, deviations), (data,), {}, {})
         return -log_p
 
+    def outer(self, z: Mapping[str, Any], data: Data, deviations: Collection[str] = ()) -> Outer:
+        """Run the function at unconstrained values z, for effects that are to be integrated out."""
+        without_rates = _WithoutRates(self._at(z, deviations))
+        log_p, _ = log_density(without_rates, (data,), {}, {})
+        rates = without_rates.rates
+        return Outer(log_p, rates.form, rates.inputs, rates.theta)
+
     def constrain(
         self, z: Mapping[str, Any], data: Data, deviations: Collection[str] = ()
     ) -> dict[str, Any]:
@@ -499,9 +525,16 @@ class FunctionModel:
         return {n: site["value"] for n, site in trace.items() if site["type"] == "deterministic"}
 
     def evaluate(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> Found:
-        """Run the function with given values of some variables; draw the others from the prior."""
+        """Run the function with given values of some variables; draw the others from the prior.
+
+        `EFFECTS` is the sum (mission, bound, robot) of the effects on the drift, if there are any.
+        """
+        values = dict(values)
+        effects = values.pop(EFFECTS, None)
         trace = self._trace(values, key, data)
         rates: Any = trace[RATES]["fn"]
+        if effects is not None:
+            rates = rates.given(effects)
         return Found(
             space=rates.form,
             inputs=rates.inputs,
@@ -515,13 +548,15 @@ class FunctionModel:
     def probe(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> Probe:
         """Run the function like `evaluate`, and return the results of all sites."""
         trace = self._trace(values, key, data)
+        rates: Any = trace[RATES]["fn"]
+        if rates.effects:  # these are not of the function itself
+            trace[RATES]["fn"] = rates.given(np.zeros(rates.shape()))
         drawn = {name: site for name, site in trace.items() if site["type"] == "sample"}
         log_p = {name: site["fn"].log_prob(site["value"]) for name, site in drawn.items()}
         for name, site in drawn.items():
             if site["scale"] is not None:
                 log_p[name] = site["scale"] * log_p[name]
 
-        rates: Any = trace[RATES]["fn"]
         return Probe(
             space=rates.form,
             inputs=rates.inputs,
@@ -538,6 +573,11 @@ class FunctionModel:
         """Return the state space, without noise of the resolution, and the inputs."""
         rates: Any = self._trace(values, key, data)[RATES]["fn"]
         return rates.space, rates.inputs
+
+    def theta(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> dict[str, Any]:
+        """Return the hyperparameters of the effects; see `models.effects.Theta`."""
+        rates: Any = self._trace(values, key, data)[RATES]["fn"]
+        return rates.theta
 
     def _trace(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> dict[str, Any]:
         """Run the function with given values of some sites."""
@@ -588,6 +628,19 @@ class FunctionModel:
         """Call a compiled function with the settings and error messages of this module."""
         with own_settings(), explained(self.in_short(), data):
             return jax.tree.map(np.asarray, compiled(*arguments))
+
+
+class _WithoutRates(Messenger):
+    """Handler that takes the distribution of the rates, and leaves a density of 1 in its place."""
+
+    rates: ContactRate
+
+    def process_message(self, msg: dict[str, Any]) -> None:
+        """Replace the distribution at the site `contact_rate`."""
+        if msg["type"] == "sample" and msg["name"] == RATES:
+            self.rates = msg["fn"]
+            msg["fn"] = Unit(jnp.zeros(self.rates.batch_shape))
+            msg["value"] = jnp.zeros((*self.rates.batch_shape, 0))
 
 
 def _transform_of(site: Mapping[str, Any], deviations: Collection[str]) -> Any:

@@ -16,7 +16,8 @@ from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, stat
 from trustbo.inference.draws import joined_draws
 from trustbo.inference.functions.coordinates import Coordinates
 from trustbo.inference.functions.data import RATES, Data
-from trustbo.inference.functions.function import FunctionModel
+from trustbo.inference.functions.effects import AddedEffects
+from trustbo.inference.functions.function import FunctionModel, Outer
 from trustbo.inference.functions.nuts import (
     Chains,
     Samples,
@@ -27,6 +28,7 @@ from trustbo.inference.functions.nuts import (
 )
 from trustbo.inference.functions.sites import Site, safe
 from trustbo.models.backend import own_settings
+from trustbo.statespace import StateSpace
 from trustbo.streams import stream
 
 AUTO, IMPORTANCE, NUTS = SAMPLERS = ("auto", "importance", "nuts")
@@ -62,10 +64,15 @@ class Drawn(NamedTuple):
     """Name of the sampler, and its diagnostics."""
     complaints: list[str]
     """Failed checks."""
+    effects: dict[str, dict[str, np.ndarray]] | None = None
+    """Variables (draw, ...) of the effects of the function, by group and name."""
 
 
 class Target:
-    """Posterior of a function given data, in some coordinates."""
+    """Posterior of a function given data, in some coordinates.
+
+    Effects that the function adds to the drift are integrated out.
+    """
 
     def __init__(
         self,
@@ -73,19 +80,51 @@ class Target:
         data: Data,
         sites: Mapping[str, Site],
         coordinates: Coordinates,
+        effects: AddedEffects | None = None,
     ) -> None:
         self.model = model
         self.data = data
         self.sites = sites
         self.coordinates = coordinates
+        self.effects = effects
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, coordinate)."""
+        if self.effects is not None:
+            log_p, space, drift, theta = self._given(x)
+            return log_p + self.effects.log_evidence(space, drift, theta)
 
         def one(x: Any, data: Data) -> Any:
             return log_density_of(self.model, self.coordinates, x, data)
 
         return self._in_batches("log density", one, x)
+
+    def draw_effects(
+        self, x: np.ndarray, rng: np.random.Generator
+    ) -> dict[str, dict[str, np.ndarray]] | None:
+        """Draw the effects of the function, if it has any, at points (draw, coordinate)."""
+        if self.effects is None:
+            return None
+        _, space, drift, theta = self._given(x)
+        return self.effects.draw(space, drift, theta, rng)
+
+    def _given(
+        self, x: np.ndarray
+    ) -> tuple[np.ndarray, StateSpace, np.ndarray, dict[str, np.ndarray]]:
+        """Return the log density without rates, and the arguments of `AddedEffects`, at points."""
+        of_points = self.coordinates
+        deviations = of_points.deviations
+
+        def one(x: Any, data: Data) -> Any:
+            found = self.model.outer(of_points.unconstrained(x), data, deviations)
+            return found._replace(log_p=found.log_p + of_points.log_jacobian(x))
+
+        found: Outer = self._in_batches("outer", one, x)
+        effects: Any = self.effects
+        shape = effects.observations.contact_rate.shape
+        drift = found.inputs.drift[:, : shape[0], : shape[1]].reshape(-1, *shape)
+        fields = [None if value is None else value[:, 0] for value in found.space]
+        return found.log_p, StateSpace(*fields), drift, found.theta
 
     def points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Convert values (draw, ...) of the variables to coordinates (draw, coordinate)."""
@@ -128,7 +167,12 @@ class Target:
         return x[np.isfinite(x).all(1)]
 
 
-def targets_of(model: FunctionModel, data: Data, sites: Mapping[str, Site]) -> list[Target]:
+def targets_of(
+    model: FunctionModel,
+    data: Data,
+    sites: Mapping[str, Site],
+    effects: AddedEffects | None = None,
+) -> list[Target]:
     """Return the posterior in all coordinates in which it is sampled.
 
     If means or standard deviations of normal variables are variables, too, the first coordinates
@@ -144,7 +188,7 @@ def targets_of(model: FunctionModel, data: Data, sites: Mapping[str, Site]) -> l
     free = model.free(data)
     noises = model.noises(data)
     return [
-        Target(model, data, sites, Coordinates(free, noises, deviations))
+        Target(model, data, sites, Coordinates(free, noises, deviations), effects)
         for deviations in ((moving, ()) if moving else ((),))
     ]
 
@@ -184,7 +228,8 @@ def sampled(
         with slow_bar("fit", " points", progress) as bar:
             charts = [_chart(one, target, starts, bar) for one in targets]
             found = mixtures.sample(charts, seed)
-        if sampler == IMPORTANCE or (sampler == AUTO and not found.complaints):
+        has_effects = target.effects is not None  # these have no gradient
+        if sampler == IMPORTANCE or has_effects or (sampler == AUTO and not found.complaints):
             return _resampled(target, found, chains * draws, seed)
 
     require_gradient(target.model, target.coordinates, target.data)
@@ -258,6 +303,7 @@ def _values_of(
 def _resampled(target: Target, found: mixtures.Sample, n: int, seed: int) -> Drawn:
     """Return n equally weighted draws of weighted points."""
     chosen = found.resample(n, stream(seed, "draws of points"))
+    x = found.x[chosen]
     attrs = {
         "sampler": IMPORTANCE,
         "k_hat": found.k_hat,
@@ -265,7 +311,8 @@ def _resampled(target: Target, found: mixtures.Sample, n: int, seed: int) -> Dra
         "log_evidence": found.log_evidence,
     }
     lp = found.log_p[chosen][None]
-    return Drawn(target.values(found.x[chosen]), {"lp": lp}, attrs, found.complaints)
+    effects = target.draw_effects(x, stream(seed, "draws of effects"))
+    return Drawn(target.values(x), {"lp": lp}, attrs, found.complaints, effects)
 
 
 class Verdict(NamedTuple):

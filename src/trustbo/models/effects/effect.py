@@ -6,7 +6,7 @@ planning need no change.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +34,14 @@ LEAST = 1e-4
 
 EFFECTS: dict[str, type["Effect"]] = {}
 """Effect classes by name, to read models from files."""
+
+
+class SampledEffect(NamedTuple):
+    """An effect within a NumPyro function, whose hyperparameters are variables of the function."""
+
+    effect: "Effect"
+    values: dict[str, Any]
+    """Hyperparameters by name."""
 
 
 class Effect:
@@ -109,6 +117,19 @@ class Effect:
     def hyperpriors(self) -> dict[str, Distribution]:
         """Return the priors on the hyperparameters by name."""
         return {name: dist.HalfNormal(getattr(self, name)) for name in self.names}
+
+    def sample(self) -> SampledEffect:
+        """Sample the hyperparameters within a NumPyro function, for `ContactRate(effects=)`.
+
+        Example:
+            >>> places = tb.models.PlaceEffect().sample()
+            >>> robots = tb.models.RobotEffect().sample()
+            >>> rates = tb.models.ContactRate(
+            ...     drift, beta0, delta_w, delta_v, n_ticks=n_ticks, effects=[places, robots]
+            ... )
+        """
+        values = {name: numpyro.sample(name, prior) for name, prior in self.hyperpriors().items()}
+        return SampledEffect(self, values)
 
     @property
     def pairs(self) -> list[Pair]:
