@@ -1,6 +1,6 @@
 """Models that are NumPyro functions: time, agreement with model classes, and calibration.
 
-    python benchmarks/functions.py [campaign] [own_campaign] [program] [samplers] [sbc]
+    python benchmarks/functions.py [campaign] [own_campaign] [as_default] [program] [samplers] [sbc]
         [--seeds N] [--sets N] [--functions NAME ...] [--slow]
 
 - campaign: run a campaign of eight missions with a saturating drift. Then run NumPyro's own MCMC
@@ -9,6 +9,8 @@
   missions. Print the CPU time with compilation and the diagnostics of both.
 - own_campaign: run a campaign of ten missions in the terrain example with two of the functions in
   own_functions.py.
+- as_default: run campaigns of ten missions with the default model and with a function that is the
+  default model, in ten worlds, and print the differences of lost contact.
 - program: compare `PooledTrust().program`, passed as a function, with `sampler="nuts"` of the
   class.
 - samplers: fit functions of own_functions.py to ten missions in the terrain example by importance
@@ -23,6 +25,7 @@
 import sys
 import time
 import warnings
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +36,7 @@ from common import Table, arguments, parsed
 from groups import holm
 from numpyro.infer import MCMC, NUTS, Predictive
 from own_functions import FUNCTIONS
+from own_functions import as_default as default_as_function
 from scipy import stats
 
 import trustbo as tb
@@ -43,6 +47,7 @@ from trustbo.inference.functions.function import as_model
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.observations import Observations
 from trustbo.planning.policies import random as random_policy
+from trustbo.study import numbers_of, run_grid, worlds
 
 FEATURES = ("traversability", "line_of_sight")
 START, GOAL = (7, 0), (0, 7)
@@ -56,6 +61,11 @@ SHORT = (
 )  # fmt: skip
 SLOW = "hsgp", "neural"
 FEW = 4  # draws of a run of NumPyro's MCMC that takes about as long as compilation
+WORLDS = (
+    "synthetic-0", "synthetic-1", "wellington", "synthetic-0-aged", "synthetic-0-slopes",
+    "synthetic-1-dense", "synthetic-1-one-poor", "synthetic-0-rain", "synthetic-2-jammer",
+    "synthetic-1-radio",
+)  # fmt: skip
 SEEDS = 1, 2, 3  # of importance sampling; seed 0 compiles
 LONG = {"draws": 5000, "warmup": 1000}  # per chain of the reference
 
@@ -171,6 +181,21 @@ def own_campaign():
         table.row(name, f"{seconds:.0f}", f"{learned} of 10", counted(fits), len(caught))
         for message in {str(one.message) for one in caught}:
             print(f"  {message}", flush=True)
+
+
+def as_default(out):
+    chosen = [world for world in worlds().values() if world.name in WORLDS]
+    scenes = {
+        world.name: partial(world.scene, "sw-ne", out / "truths", "shortest+4") for world in chosen
+    }
+    cases = {"as a function": {"model": default_as_function}, "default": {}}
+    started = time.process_time()
+    runs = run_grid(cases, scenes, out, n_missions=10, n_jobs=1)
+    print(f"{time.process_time() - started:.0f} CPU s", flush=True)
+    columns = ["lost while learning", "lost while learning low", "lost while learning high"]
+    table = numbers_of(runs)
+    print(table.pivot(index="scene", columns="case", values="lost while learning").round(4))
+    print(tb.study.differences(table, "as a function")[columns].round(4).to_string(), flush=True)
 
 
 def in_terrain():
@@ -385,10 +410,10 @@ def sbc(sets):
           "diagnostics", flush=True)  # fmt: skip
 
 
-PARTS = "campaign", "own_campaign", "program", "samplers", "sbc"
+PARTS = "campaign", "own_campaign", "as_default", "program", "samplers", "sbc"
 
 if __name__ == "__main__":
-    parser = arguments(__doc__, names=PARTS, seeds=3)
+    parser = arguments(__doc__, names=PARTS, seeds=3, out="out/functions")
     parser.add_argument("--sets", type=int, default=100, help="data sets of sbc, default 100")
     parser.add_argument("--functions", nargs="+", choices=FUNCTIONS, metavar="NAME",
                         help="functions of samplers")  # fmt: skip
@@ -397,6 +422,7 @@ if __name__ == "__main__":
     calls = {
         "campaign": lambda: campaign(given.seeds),
         "own_campaign": own_campaign,
+        "as_default": lambda: as_default(given.out),
         "program": lambda: program(given.seeds),
         "samplers": lambda: samplers(given.functions or SHORT + (SLOW if given.slow else ())),
         "sbc": lambda: sbc(given.sets),

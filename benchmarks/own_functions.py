@@ -9,7 +9,15 @@ import numpyro
 import numpyro.distributions as dist
 from numpyro.contrib.hsgp.approximation import hsgp_squared_exponential
 
-from trustbo.models import ContactRate, CoupledTrust, HierarchicalTrust, PooledTrust
+from trustbo.models import (
+    ContactRate,
+    CoupledTrust,
+    HierarchicalTrust,
+    PlaceEffect,
+    PooledTrust,
+    Priors,
+    RobotEffect,
+)
 
 SIGHT = 2  # index of line of sight among the features
 N_UNITS = 4  # hidden units of the neural network
@@ -168,6 +176,21 @@ def neural(awareness, contact_rate=None, n_ticks=None):
     level = numpyro.sample("level", dist.Normal(0.3, 0.3))
     drift = level + jnp.tanh(awareness @ w1 + b1) @ w2
     observed(drift, beta0, *noises(), contact_rate, n_ticks)
+
+
+def as_default(awareness, features, contact_rate=None, n_ticks=None):
+    """The default model, with its priors, effects of places and effects of robots."""
+    priors = Priors.from_features(tuple(features))
+    beta0 = numpyro.sample("beta0", priors.beta0)
+    delta_w = numpyro.sample("delta_w", priors.delta_w)
+    delta_v = numpyro.sample("delta_v", priors.delta_v)
+    mean, sd = priors.coefficients(len(features))
+    c = numpyro.sample("c", dist.Normal(mean, sd).to_event(1))
+
+    drift = (1.0 - beta0) * (awareness @ c[:-1] + c[-1])
+    effects = [PlaceEffect().sample(), RobotEffect().sample()]
+    start = {"x0_mean": priors.x0_mean, "x0_sd": priors.x0_sd}
+    observed(drift, beta0, delta_w, delta_v, contact_rate, n_ticks, effects=effects, **start)
 
 
 FUNCTIONS = {
