@@ -19,7 +19,7 @@
   without compilation. Then compare the means and standard deviations of importance sampling with
   those of a long run of NUTS. If R-hat of the long run is large, it is no reference. `--slow` adds
   two functions that take minutes.
-- sbc: check the saturating model, fitted by `tb.fit`, by simulation-based calibration.
+- sbc: check the fits of four functions by simulation-based calibration.
 """
 
 import sys
@@ -46,7 +46,6 @@ from trustbo.inference.functions.draws import FunctionDraws
 from trustbo.inference.functions.function import as_model
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.observations import Observations
-from trustbo.planning.policies import random as random_policy
 from trustbo.study import numbers_of, run_grid, worlds
 
 FEATURES = ("traversability", "line_of_sight")
@@ -60,6 +59,7 @@ SHORT = (
     "two_modes", "shared_noise",
 )  # fmt: skip
 SLOW = "hsgp", "neural"
+CALIBRATED = "four", "saturating", "two_modes", "shared_noise"
 FEW = 4  # draws of a run of NumPyro's MCMC that takes about as long as compilation
 WORLDS = (
     "synthetic-0", "synthetic-1", "wellington", "synthetic-0-aged", "synthetic-0-slopes",
@@ -357,43 +357,49 @@ def of_likelihoods(function, values, model, tree, missions):
     return np.abs(found / wanted - 1.0).max()
 
 
-def with_rates(awareness, rates):
+def with_rates(awareness, rates, features):
     """Make a mission with any rates; simulated ones may leave [0, 1], which missions refuse."""
     inside = np.full(rates.shape, 0.5)
-    mission = tb.Mission.from_arrays(None, awareness, inside, features=FEATURES)
+    mission = tb.Mission.from_arrays(None, awareness, inside, features=features)
     for bound, of_bound in zip(mission.bounds, rates, strict=True):
         object.__setattr__(bound, "contact_rate", of_bound)
     return mission
 
 
-def sbc(sets):
-    """Rank true parameters among posterior draws (Talts et al. 2018)."""
-    workspace, simulator = world(0)
-    nothing = TrustParams(0.4, np.zeros(2), 0.0, 0.03, 0.04).flat()
-    planner = tb.Planner(workspace, START, GOAL)
-    rng = np.random.default_rng(1)
-    paths = [random_policy(rng, nothing, planner).path for _ in range(4)]
-    z, _ = padded([simulator.run(path, seed=1) for path in paths])
+def sbc(names, sets):
+    for name in names:
+        print(f"sbc of {name}", flush=True)
+        sbc_of(FUNCTIONS[name], sets)
 
+
+def sbc_of(function, sets):
+    """Rank true parameters among posterior draws (Talts et al. 2018)."""
+    driven = in_terrain()[::3]
+    data = unpadded(as_model(function), driven) | {"contact_rate": None, "n_ticks": None}
     ranks = {}
     refused = 0
     for seed in range(sets):
         with jax.enable_x64(True):
-            true = Predictive(saturating, num_samples=1)(jax.random.key(seed), jnp.asarray(z))
-        rates = np.asarray(true.pop("contact_rate"))[0]
+            drawn = Predictive(function, num_samples=1)(jax.random.key(seed), **data)
+        true = {name: np.asarray(value)[0] for name, value in drawn.items()}
+        rates = true.pop("contact_rate")
         missions = [
-            with_rates(z[j, : len(path) - 1], rates[j, : len(path) - 1])
-            for j, path in enumerate(paths)
+            with_rates(one.awareness, y[: len(one.bounds)], one.features)
+            for one, y in zip(driven, rates, strict=True)
         ]
         try:
-            tree = tb.fit(missions, saturating, seed=seed, latent=False, progress=False)
+            tree = tb.fit(missions, function, seed=seed, latent=False, progress=False)
         except tb.errors.PosteriorError as error:
             refused += 1
             tree = error.posterior
         for name, value in true.items():
-            draws = tree["posterior"][name].values.ravel()
-            some = draws[np.linspace(0, draws.size - 1, RANKED).astype(int)]
-            ranks.setdefault(name, []).append(int((some < float(value[0])).sum()))
+            draws = tree["posterior"][name].values
+            draws = draws.reshape(-1, *np.shape(value))
+            some = draws[np.linspace(0, len(draws) - 1, RANKED).astype(int)]
+            below = (some < value).sum(0)
+            for where, rank in np.ndenumerate(below):
+                label = f"{name}{list(where)}" if where else name
+                ranks.setdefault(label, []).append(int(rank))
 
         if (seed + 1) % PRINTED == 0:
             means = ", ".join(f"{name} {np.mean(r) / RANKED:.2f}" for name, r in ranks.items())
@@ -414,9 +420,9 @@ PARTS = "campaign", "own_campaign", "as_default", "program", "samplers", "sbc"
 
 if __name__ == "__main__":
     parser = arguments(__doc__, names=PARTS, seeds=3, out="out/functions")
-    parser.add_argument("--sets", type=int, default=100, help="data sets of sbc, default 100")
+    parser.add_argument("--sets", type=int, default=200, help="data sets of sbc, default 200")
     parser.add_argument("--functions", nargs="+", choices=FUNCTIONS, metavar="NAME",
-                        help="functions of samplers")  # fmt: skip
+                        help="functions of samplers or sbc")  # fmt: skip
     parser.add_argument("--slow", action="store_true", help="add slow functions to samplers")
     given = parsed(parser)
     calls = {
@@ -425,7 +431,7 @@ if __name__ == "__main__":
         "as_default": lambda: as_default(given.out),
         "program": lambda: program(given.seeds),
         "samplers": lambda: samplers(given.functions or SHORT + (SLOW if given.slow else ())),
-        "sbc": lambda: sbc(given.sets),
+        "sbc": lambda: sbc(given.functions or CALIBRATED, given.sets),
     }
     for name in given.names:
         print(name, flush=True)

@@ -109,7 +109,7 @@ class ContactRate(dist.Distribution):
                 it is the log density of the rates.
             effects: Effects that are added to the drift, such as `[PlaceEffect().sample(),
                 RobotEffect().sample()]`. `fit` integrates them out, and then draws them. As they
-                belong to several missions, `log_prob` is not defined.
+                belong to several missions, `log_prob` and `sample` are not defined.
 
         Raises:
             TrustboError: If the drift or a parameter has the wrong shape; or if there are effects,
@@ -194,6 +194,14 @@ class ContactRate(dist.Distribution):
         self.theta: dict[str, Any] = {}  # hyperparameters of the effects; see `effects.Theta`
         dist.Distribution.__init__(self, shape[:1], shape[1:])
 
+    def _require_no_effects(self, what: str) -> None:
+        """Raise TrustboError if there are effects, which belong to several missions."""
+        if self.effects:
+            raise TrustboError(
+                f"a ContactRate with effects has no {what} of single missions; fit the function "
+                "with trustbo.fit, which integrates the effects out and draws rates."
+            )
+
     @property
     def form(self) -> StateSpace:
         """State space of the rates: `space` with the noise of their resolution."""
@@ -231,11 +239,7 @@ class ContactRate(dist.Distribution):
         Raises TrustboError if there are effects, or unless `value` has the shape (mission, bound,
         robot) of the drift.
         """
-        if self.effects:
-            raise TrustboError(
-                "a ContactRate with effects has no density of single missions; fit the function "
-                "with trustbo.fit, which integrates the effects out."
-            )
+        self._require_no_effects("density")
         drift, offset = self.inputs
         n_missions, n_bounds, n_groups, n_members = drift.shape
         shape = n_missions, n_bounds, n_groups * n_members
@@ -266,7 +270,11 @@ class ContactRate(dist.Distribution):
     def sample(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, key: Array, sample_shape: tuple[int, ...] = ()
     ) -> Array:
-        """Draw contact rates with shape `(*sample_shape, mission, bound, robot)`."""
+        """Draw contact rates with shape `(*sample_shape, mission, bound, robot)`.
+
+        Raises TrustboError if there are effects.
+        """
+        self._require_no_effects("draws")
         space = self.form
         drift, offset = self.inputs
         shape = *sample_shape, *drift.shape
