@@ -26,6 +26,7 @@ more points. The points of both runs are returned, weighted by the mixture of al
 """
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -51,7 +52,8 @@ second number is that of a second attempt, after two runs that do not agree."""
 _STEP = 0.15
 """Part of this number to which a step of beta may reduce it."""
 _MOST_STRICT = 10
-"""Number of coordinates up to which a step reduces it only after rounds without progress.
+"""Number of coordinates up to which a step reduces it only after rounds without progress, and up to
+which lost modes are searched.
 
 Large steps lose modes, but with more coordinates, small ones take too many rounds.
 """
@@ -72,7 +74,7 @@ _LARGE = 4 * BATCH
 _MOST_LARGE = 24
 """Largest number of these rounds."""
 _ENOUGH = 1000.0
-"""Effective number of points of each run at which it ends."""
+"""Effective number of points of all charts of a run together at which it ends."""
 _WIDER = 1.5
 """Scale of the wide components relative to the others."""
 _LOST = np.log(1000.0)
@@ -87,7 +89,9 @@ the refinement. The last one covers modes that a fit has lost."""
 _FIRST = 0.8
 """Share of the first proposal that is fitted to the first of several starts."""
 _STEPS = 6
-"""Steps of expectation maximisation per round."""
+"""Steps of expectation maximisation per round of the search; fewer would lose modes."""
+_STEPS_OF_MANY = 3
+"""The same per round of the refinement with more than `_MOST_STRICT` coordinates, to save time."""
 _POINTS_PER_AXIS = 2.0
 """Effective points per coordinate below which a component is dropped."""
 _NEGLIGIBLE = 1e-6
@@ -96,6 +100,8 @@ _FARTHEST = 1e5
 """Smaller log weights, relative to the largest one, are raised to this distance."""
 _RIDGE = 1e-10
 """Variance that is added to all covariances."""
+_AT_ONCE = 1024
+"""Number of points whose densities are computed at once, in memory that is near the processor."""
 _FIRST_LOG_BETA = -20.0
 """Log beta of the first round, at which the density is practically that of the first proposal."""
 _BISECTIONS = 20
@@ -163,7 +169,8 @@ class Mixture(NamedTuple):
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, coordinate)."""
-        return np.logaddexp.reduce(self._log_parts(x)[0], axis=0)
+        parts = [x[k : k + _AT_ONCE] for k in range(0, len(x), _AT_ONCE)]
+        return np.concatenate([_log_sum(self._log_parts(part)[0]) for part in parts])
 
     def nearest(self, x: np.ndarray) -> np.ndarray:
         """Return the component (point,) that is most probable at points (point, coordinate)."""
@@ -177,9 +184,12 @@ class Mixture(NamedTuple):
     def _log_parts(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute log (share times density), and squared distances, of shape (component, point)."""
         nu = _DEGREES
-        d = x.shape[1]
-        away = np.swapaxes(x[None] - self.center[:, None], 1, 2)
-        square = (np.matmul(np.linalg.inv(self.scale), away) ** 2).sum(1)
+        n, d = x.shape
+        whitening = np.linalg.inv(self.scale)
+        center = (whitening @ self.center[..., None]).reshape(-1, 1)
+        white = whitening.reshape(-1, d) @ x.T - center  # (component * coordinate, point)
+        white = white.reshape(-1, d, n)
+        square = np.einsum("kdn,kdn->kn", white, white)
 
         constant = special.gammaln(0.5 * (nu + d)) - special.gammaln(0.5 * nu)
         constant -= 0.5 * d * np.log(nu * np.pi)
@@ -187,7 +197,7 @@ class Mixture(NamedTuple):
         log_part = np.log(self.share) + constant - log_root
         return log_part[:, None] - 0.5 * (nu + d) * np.log1p(square / nu), square
 
-    def fitted(self, x: np.ndarray, weight: np.ndarray) -> Self:
+    def fitted(self, x: np.ndarray, weight: np.ndarray, n_steps: int = _STEPS) -> Self:
         """Fit the mixture to points x (point, coordinate) with weights (point,) of sum 1.
 
         Each step is that of expectation maximisation for Student-t distributions with known degrees
@@ -201,7 +211,7 @@ class Mixture(NamedTuple):
         d = x.shape[1]
         n_effective = 1.0 / (weight**2).sum()
         mixture = self
-        for _ in range(_STEPS):
+        for _ in range(n_steps):
             log_part, square = mixture._log_parts(x)
             own = weight * np.exp(log_part - special.logsumexp(log_part, axis=0))
             share = own.sum(1)
@@ -330,6 +340,7 @@ def sample(charts: Sequence[Chart], seed: int) -> Sample:
         charts: Coordinates of the posterior. The points of the result are those of the first.
         seed: Random seed.
     """
+    enough = _ENOUGH / len(charts)
     for attempt, wanted in enumerate(_WANTED):
         runs = []
         for k in range(_N_RUNS):
@@ -339,10 +350,10 @@ def sample(charts: Sequence[Chart], seed: int) -> Sample:
                 mixture, log_beta = search(chart.log_density, chart.starts, wanted, rng)
                 if log_beta < 0.0:
                     return _failed(chart, mixture, log_beta, rng)
-                parts.append(_refined(chart.log_density, mixture, rng))
+                parts.append(_refined(chart.log_density, mixture, enough, rng))
 
             runs.append(_Run(charts, parts))
-            if not runs[-1].is_good:
+            if not _is_good(runs[-1].log_weight(), enough):
                 return _pooled(runs)
 
         found = _pooled(runs)
@@ -362,24 +373,18 @@ class _Run:
 
     def __init__(self, charts: Sequence[Chart], parts: Sequence[_Rounds]) -> None:
         self.proposals = [part.proposals for part in parts]
-        if len(charts) == 1:
-            self.x = [parts[0].x]
-            self.log_p = [parts[0].log_p]
-            return
-
-        firsts = [chart.to_first(part.x) for chart, part in zip(charts, parts, strict=True)]
-        first = np.concatenate(firsts)
         self.x = []
         self.log_p = []
-        begin = 0
+        firsts = [chart.to_first(part.x) for chart, part in zip(charts, parts, strict=True)]
         for chart, part in zip(charts, parts, strict=True):
-            own = slice(begin, begin + len(part.x))
-            x = chart.from_first(first)
-            x[own] = part.x
-            log_p = chart.log_density(x)
-            self.x.append(x)
-            self.log_p.append(np.where(np.isfinite(log_p), log_p, -np.inf))
-            begin = own.stop
+            x = []
+            log_p = []
+            for first, other in zip(firsts, parts, strict=True):
+                x.append(part.x if other is part else chart.from_first(first))
+                log_p.append(part.log_p if other is part else chart.log_density(x[-1]))
+            self.x.append(np.concatenate(x))
+            of_chart = np.concatenate(log_p)
+            self.log_p.append(np.where(np.isfinite(of_chart), of_chart, -np.inf))
 
     def log_q(self, other: "_Run") -> np.ndarray:
         """Log density (point,) of the proposals of this run at the points of another run.
@@ -397,14 +402,14 @@ class _Run:
             parts += [one.log_density(x) + log_volume for one in proposals]
         return np.logaddexp.reduce(parts, axis=0) - np.log(len(parts))
 
+    @cached_property
+    def own_log_q(self) -> np.ndarray:
+        """Log density (point,) of the proposals at the points; see `log_q`."""
+        return self.log_q(self)
+
     def log_weight(self) -> np.ndarray:
         """Log weights (point,) of the points."""
-        return _ratio(self.log_p[0], self.log_q(self))
-
-    @property
-    def is_good(self) -> bool:
-        """Whether enough points are effective, and k-hat is good."""
-        return _is_good(self.log_weight())
+        return _ratio(self.log_p[0], self.own_log_q)
 
 
 def search(
@@ -414,6 +419,9 @@ def search(
     found, log_beta, visited = _searched(log_density, starts, wanted, rng)
     if log_beta < 0.0:
         return found, log_beta
+
+    if found.center.shape[1] > _MOST_STRICT:
+        return found, log_beta  # the points of a bent posterior would look like other modes
 
     lost = lost_modes(visited, found, log_density)
     if len(lost):
@@ -547,6 +555,12 @@ class _Path:
         return log_beta, log_weight
 
 
+def _log_sum(log_part: np.ndarray) -> np.ndarray:
+    """Compute the logarithms of sums over the first axis; at least one part is finite."""
+    most = log_part.max(0)
+    return np.log(np.exp(log_part - most).sum(0)) + most
+
+
 def _last_above(
     wanted: float, function: Callable[[float], float], low: float, high: float
 ) -> float:
@@ -572,22 +586,26 @@ def _fitted_to(x: np.ndarray, rng: np.random.Generator) -> Mixture:
     return Mixture.near(x, weight, _n_components(x.shape[1]), rng).fitted(x, weight)
 
 
-def _refined(log_density: LogDensity, mixture: Mixture, rng: np.random.Generator) -> _Rounds:
-    """Draw large rounds from mixtures that are fitted to all of their points."""
+def _refined(
+    log_density: LogDensity, mixture: Mixture, enough: float, rng: np.random.Generator
+) -> _Rounds:
+    """Draw large rounds from mixtures that are fitted to all points, until enough are effective."""
     found = mixture
-    n_components = _n_components(found.center.shape[1])
+    d = found.center.shape[1]
+    n_components = _n_components(d)
+    n_steps = _STEPS if d <= _MOST_STRICT else _STEPS_OF_MANY
     rounds = _Rounds(_MOST_LARGE)
     while True:
         proposal = Mixture.joined([mixture, mixture.wider(), found], _SHARES)
         rounds.add(proposal, _LARGE, log_density, rng)
         log_weight = rounds.log_weight()
-        if _is_good(log_weight) or len(rounds.proposals) == _MOST_LARGE:
+        if _is_good(log_weight, enough) or len(rounds.proposals) == _MOST_LARGE:
             return rounds
 
         weight, _, _ = smoothed(log_weight)
         if len(mixture.share) < n_components:
             mixture = Mixture.near(rounds.x, weight, n_components, rng)
-        mixture = mixture.fitted(rounds.x, weight)
+        mixture = mixture.fitted(rounds.x, weight, n_steps)
 
 
 def _n_components(d: int) -> int:
@@ -600,20 +618,20 @@ def _ratio(log_p: np.ndarray, log_q: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(log_p), log_p - np.where(np.isfinite(log_q), log_q, 0.0), -np.inf)
 
 
-def _is_good(log_weight: np.ndarray) -> bool:
+def _is_good(log_weight: np.ndarray, enough: float) -> bool:
     """Return whether enough points are effective, and k-hat is good."""
     weight, k_hat, _ = smoothed(log_weight)
-    return k_hat <= MAX_KHAT and (weight**2).sum() * _ENOUGH <= 1.0
+    return k_hat <= MAX_KHAT and (weight**2).sum() * enough <= 1.0
 
 
 def _pooled(runs: Sequence[_Run]) -> Sample:
     """Join the points of runs, and list the reasons why they may not represent the posterior."""
     x = np.concatenate([run.x[0] for run in runs])
     log_p = np.concatenate([run.log_p[0] for run in runs])
-    log_q = [
-        np.concatenate([one.log_q(run) for run in runs]) + np.log(len(one.x[0]) / len(x))
-        for one in runs
-    ]
+    log_q = []
+    for one in runs:
+        of_runs = [one.own_log_q if run is one else one.log_q(run) for run in runs]
+        log_q.append(np.concatenate(of_runs) + np.log(len(one.x[0]) / len(x)))
     log_weight = _ratio(log_p, np.logaddexp.reduce(log_q, axis=0))
     weight, k_hat, log_evidence = smoothed(log_weight)
     x = np.where((weight > 0.0)[:, None], x, 0.0)  # points at infinity have no weight
