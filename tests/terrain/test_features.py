@@ -121,6 +121,14 @@ def test_float32_heights_give_what_float64_gives():
         np.testing.assert_allclose(compute(single), compute(double), rtol=3e-6, atol=3e-6)
 
 
+def test_features_of_tall_rasters_equal_those_of_their_parts():
+    tall = rough_terrain(n=200)
+    tall["dem"][[60, 64, 127], [3, 70, 20]] = np.nan  # beside the blocks that threads compute
+    part = tall.isel(y=slice(50, 150), x=slice(None))
+    for compute in (slope, roughness, tri, step_height):
+        np.testing.assert_array_equal(compute(tall)[51:149], compute(part)[1:-1])
+
+
 def test_canopy_height_and_cover():
     height = np.zeros((40, 40))
     height[:, 20:] = 8.0

@@ -62,10 +62,12 @@ class CompositeIndex:
         if not len(known):
             raise TrustboError(f"no pixel has all of the features {', '.join(self.signs)}.")
 
-        known = known[:: -(-len(known) // MAX_PIXELS)]
-        x = np.stack([column.ravel()[known] for column in columns], axis=1)
+        known = known[:: -(-len(known) // MAX_PIXELS)].copy()  # not a view of all samples
+        x = np.empty((len(known), len(columns)))
+        for k, column in enumerate(columns):
+            x[:, k] = column.ravel()[known]
         del known
-        low, high = np.percentile(x, _WINSORISED, axis=0)
+        low, high = np.transpose([np.percentile(column, _WINSORISED) for column in x.T])
         np.clip(x, low, high, out=x)
 
         mean = x.mean(0)
@@ -76,15 +78,15 @@ class CompositeIndex:
 
         x -= mean
         x /= sd
-        z = x[:, varies]
+        x = x[:, varies]
         signs = np.array([*self.signs.values()])
         loadings = np.zeros(len(signs))
         ratios = np.ones(1)
         if varies.any():
-            first, ratios = _first_component(z)
+            first, ratios = _first_component(x)
             loadings[varies] = (np.sign(first @ signs[varies]) or 1.0) * first
 
-        score = z @ loadings[varies]
+        score = x @ loadings[varies]
         bottom, top = np.percentile(score, _SCALED)
         if top - bottom < _CONSTANT:  # nearly all samples are alike: take the extremes
             bottom = score.min()
@@ -139,16 +141,19 @@ class CompositeIndex:
         weights = fitted["loading"].values / sd
         bottom = fitted.bottom
         top = fitted.top
-        score: np.ndarray | float = 0.0
-        for k, column in enumerate(self._columns(features)):
+        columns = self._columns(features)
+        score = np.zeros(columns[0].shape)
+        for k, column in enumerate(columns):
             x = np.clip(column, low[k], high[k])
             x -= mean[k]
             x *= weights[k]
-            score = score + x
+            score += x
 
         if top - bottom < _CONSTANT:
             return np.where(np.isfinite(score), 0.5, np.nan)
-        return np.clip((score - bottom) / (top - bottom), 0.0, 1.0)
+        score -= bottom
+        score /= top - bottom
+        return np.clip(score, 0.0, 1.0, out=score)
 
     def _columns(self, features: Mapping[str, ArrayLike] | xr.Dataset) -> list[np.ndarray]:
         remedy = "give the values of each feature by name"

@@ -164,6 +164,25 @@ def _all_heights(z: np.ndarray) -> Iterator[np.ndarray]:
     return starmap(_window(z), product((-1, 0, 1), repeat=2))
 
 
+def _by_rows(
+    compute: Callable[[np.ndarray], np.ndarray], z: np.ndarray, *n_maps: int
+) -> np.ndarray:
+    """Compute maps of 3 x 3 windows on blocks of rows, so that only small arrays are temporary.
+
+    `compute` converts heights (row, col) to maps (*n_maps, row, col). It also gets the rows beside
+    a block; the values at these rows are dropped.
+    """
+    maps = np.empty((*n_maps, *z.shape), np.result_type(z, np.float32))
+
+    def work(first: int, last: int) -> None:
+        north = max(first - 1, 0)
+        of_block = compute(z[north : last + 1])
+        maps[..., first:last, :] = of_block[..., first - north : last - north, :]
+
+    over_rows(work, len(z))
+    return maps
+
+
 def _straight_on(z: np.ndarray, width: Any) -> np.ndarray:
     """Pad heights with twice the outermost minus the next one; a single one is repeated."""
     return np.pad(z, width, mode="reflect", reflect_type="odd")
@@ -185,8 +204,13 @@ def gradient(dem: np.ndarray, pixel: tuple[float, float]) -> np.ndarray:
 
 def horn_gradient(dem: np.ndarray, pixel: tuple[float, ...]) -> np.ndarray:
     """Compute the gradient of heights and pixels that have been checked; see `gradient`."""
+    return _by_rows(lambda z: _gradient_of(z, pixel), dem, 2)
+
+
+def _gradient_of(z: np.ndarray, pixel: tuple[float, ...]) -> np.ndarray:
+    """Compute the gradient of a block of rows; see `gradient`."""
     height, width = pixel
-    w = _window(dem)
+    w = _window(z)
     east = (w(-1, 1) - w(-1, -1)) + 2.0 * (w(0, 1) - w(0, -1)) + (w(1, 1) - w(1, -1))
     south = (w(1, -1) - w(-1, -1)) + 2.0 * (w(1, 0) - w(-1, 0)) + (w(1, 1) - w(-1, 1))
     return np.stack([0.125 * east / width, -0.125 * south / height])
@@ -195,30 +219,43 @@ def horn_gradient(dem: np.ndarray, pixel: tuple[float, ...]) -> np.ndarray:
 @feature("slope", sign=-1)
 def slope(terrain: xr.Dataset) -> np.ndarray:
     """Compute the slope of the ground, rad (Horn 1981)."""
-    z = terrain["dem"].values
-    steepness = np.hypot(*horn_gradient(z, pixel_size(terrain)))
-    return np.arctan(steepness) + (z - z)  # missing stays missing
+    pixel = pixel_size(terrain)
+
+    def of_block(z: np.ndarray) -> np.ndarray:
+        steepness = np.hypot(*_gradient_of(z, pixel))
+        return np.arctan(steepness) + (z - z)  # missing stays missing
+
+    return _by_rows(of_block, terrain["dem"].values)
 
 
 @feature("roughness", sign=-1)
 def roughness(terrain: xr.Dataset) -> np.ndarray:
     """Compute the range of ground heights in the 3 x 3 window, m (Wilson et al. 2007)."""
-    z = terrain["dem"].values
-    return reduce(np.maximum, _all_heights(z)) - reduce(np.minimum, _all_heights(z))
+
+    def of_block(z: np.ndarray) -> np.ndarray:
+        return reduce(np.maximum, _all_heights(z)) - reduce(np.minimum, _all_heights(z))
+
+    return _by_rows(of_block, terrain["dem"].values)
 
 
 @feature("tri", sign=-1)
 def tri(terrain: xr.Dataset) -> np.ndarray:
     """Compute the terrain ruggedness index, m: root sum of squared steps (Riley 1999)."""
-    z = terrain["dem"].values
-    return np.sqrt(sum(((w - z) ** 2 for w in _all_heights(z)), np.zeros_like(z)))
+
+    def of_block(z: np.ndarray) -> np.ndarray:
+        return np.sqrt(sum(((w - z) ** 2 for w in _all_heights(z)), np.zeros_like(z)))
+
+    return _by_rows(of_block, terrain["dem"].values)
 
 
 @feature("step_height", sign=-1)
 def step_height(terrain: xr.Dataset) -> np.ndarray:
     """Compute the largest step to one of the 8 neighbours, m; missing neighbours are ignored."""
-    z = terrain["dem"].values
-    return reduce(np.maximum, (np.abs(w - z) for w in _all_heights(z)))
+
+    def of_block(z: np.ndarray) -> np.ndarray:
+        return reduce(np.maximum, (np.abs(w - z) for w in _all_heights(z)))
+
+    return _by_rows(of_block, terrain["dem"].values)
 
 
 @feature("canopy_height", sign=-1)
@@ -280,17 +317,21 @@ def openness(
 
     over_rows(work, len(coarse))
     whole = coarse.repeat(rays.BLOCK, axis=0).repeat(rays.BLOCK, axis=1)[:rows, :cols]
-    return np.where(np.isfinite(ground), whole, np.nan)
+    whole[~np.isfinite(ground)] = np.nan
+    return whole
 
 
 def _local_mean(terrain: xr.Dataset, values: np.ndarray) -> np.ndarray:
     """Average valid pixels in squares of half-width 5 m, in [0, 1]; NaN without ground."""
-    size = [2 * max(1, round(_HALF_WIDTH / step)) + 1 for step in pixel_size(terrain)]
-    has_ground = np.isfinite(terrain["dem"].values)
+    size: Any = [2 * max(1, round(_HALF_WIDTH / step)) + 1 for step in pixel_size(terrain)]
     valid = np.isfinite(values)
-    total, weight = (
-        np.asarray(ndimage.uniform_filter(a, size, mode="nearest"))  # pyright: ignore[reportArgumentType]
-        for a in (np.where(valid, values, 0.0), valid.astype(float))
-    )
+    total = np.where(valid, values, 0.0)
+    weight = valid.astype(float)
+    for sums in (total, weight):
+        ndimage.uniform_filter(sums, size, output=sums, mode="nearest")
+
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(has_ground, (total / weight).clip(0.0, 1.0), np.nan)
+        total /= weight
+    np.clip(total, 0.0, 1.0, out=total)
+    total[~np.isfinite(terrain["dem"].values)] = np.nan
+    return total

@@ -53,25 +53,28 @@ def in_metres(stored: xr.DataArray, axis: float | None, nodata: float | None) ->
     if abs(metres) != 1.0:
         warn(f"{name} has heights in units of {abs(metres):.6g} m; they are converted to metres.")
 
-    values = raw.astype(float)
-    missing = ~np.isfinite(values)
+    # In place, because rasters may fill the memory.
+    heights = raw.astype(float)
+    missing = ~np.isfinite(heights)
     for fill in _fills(name, attrs, nodata):
         with np.errstate(over="ignore"):
             missing |= raw == fill  # rounded to the raster's type: float32 has no -3.4e38
 
-    values[missing] = np.nan
+    heights[missing] = np.nan
 
     scale = _number(name, attrs, "scale_factor", 1.0)
     offset = _number(name, attrs, "add_offset", 0.0)
-    suspicious = np.isin(values, _FILLS if scale != 1.0 else (*_FILLS, -999.0))
+    suspicious = np.isin(heights, _FILLS if scale != 1.0 else (*_FILLS, -999.0))
 
-    heights = metres * (scale * values + offset)
+    heights *= scale
+    heights += offset
+    heights *= metres
     wrong = ~missing & (suspicious | (heights < LOWEST) | (heights > HIGHEST))
     if not wrong.any():
         _warn_of_zeros(heights, name)
         _warn_of_levels(heights, raw, name)
         if scale != 1.0:
-            _warn_of_second_scale(values[~missing], scale, name)
+            _warn_of_second_scale(raw[~missing], scale, name)
         return heights
 
     r, c = np.unravel_index(np.argmax(wrong), wrong.shape)
@@ -132,12 +135,14 @@ def _warn_of_zeros(heights: np.ndarray, name: str) -> None:
     far away and differ: walls on a floor often have one height.
     """
     n_zero = int((heights == 0.0).sum())
-    n_low = int((np.abs(heights) <= _LOW).sum()) - n_zero
-    high = heights[np.abs(heights) > _LOW]
+    n_low = int(((heights >= -_LOW) & (heights <= _LOW)).sum()) - n_zero
+    is_high = (heights < -_LOW) | (heights > _LOW)
+    n_high = int(is_high.sum())
 
     few_are_low = n_low < 0.1 * n_zero
-    if n_zero >= n_low + len(high):
-        few_are_low = n_low == 0 and len(high) > 0 and high.min() < high.max()
+    if n_zero >= n_low + n_high:
+        low, high = _range_of(heights, is_high)
+        few_are_low = n_low == 0 and low < high
 
     if n_zero and few_are_low:
         warn(
@@ -158,16 +163,23 @@ def _warn_of_levels(heights: np.ndarray, raw: np.ndarray, name: str) -> None:
     highest = np.fmax.reduce(heights, axis=None)
     for level, gap in ((lowest, _LOW), (highest, _FAR)):
         is_level = heights == level
-        others = heights[np.isfinite(heights) & ~is_level]
-        if level == 0.0 or not 2 <= is_level.sum() < len(others):
+        is_other = np.isfinite(heights) & ~is_level
+        if level == 0.0 or not 2 <= is_level.sum() < is_other.sum():
             continue
 
-        if np.abs(others - level).min() > gap and others.min() < others.max():
+        low, high = _range_of(heights, is_other)
+        if min(abs(low - level), abs(high - level)) > gap and low < high:
             warn(
                 f"{name} is exactly {level:g} m on {is_level.mean():.1%} of its pixels, but no "
                 f"other height is within {gap:g} m: they may be missing heights that were scaled "
                 f"or shifted; pass nodata={float(raw[is_level][0])!r} if they are."
             )
+
+
+def _range_of(heights: np.ndarray, chosen: np.ndarray) -> tuple[float, float]:
+    """Return the lowest and the highest of the chosen heights; (inf, -inf) if none is chosen."""
+    lowest = np.min(heights, where=chosen, initial=np.inf)
+    return float(lowest), float(np.max(heights, where=chosen, initial=-np.inf))
 
 
 def _warn_of_second_scale(values: np.ndarray, scale: float, name: str) -> None:

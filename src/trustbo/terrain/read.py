@@ -209,7 +209,10 @@ def _heights(array: xr.DataArray, given: object, nodata: float | None) -> xr.Dat
     values = in_metres(array, axis, nodata)
     coords = {axis: array[axis].values for axis in ("y", "x")}
     heights = xr.DataArray(values, coords, name=name, attrs={"datum": datum})
-    heights = heights.sortby("y", ascending=False).sortby("x")
+    if coords["y"][0] < coords["y"][-1]:
+        heights = heights.sortby("y", ascending=False)
+    if coords["x"][0] > coords["x"][-1]:
+        heights = heights.sortby("x")
     return placed(heights.rio.write_crs(horizontal(crs).to_string(), inplace=True), name)
 
 
@@ -464,16 +467,18 @@ def _paired(ground: xr.DataArray, surface: xr.DataArray, sides: tuple[float, flo
             f"Check that {check}."
         )
 
-    low, middle = np.quantile(canopy, [0.05, 0.5])
+    low, middle = np.quantile(canopy, [0.05, 0.5], overwrite_input=True)
+    del canopy
     if low > _RAISED or middle > _TALL:
         warn(
             f"the DSM lies {middle:.3g} m above the DEM in the median, and over {low:.3g} m nearly "
             "everywhere: check that both have the same unit and the same vertical datum."
         )
 
-    heights = {"dem": dem, "dsm": np.fmax(dem, dsm)}
-    masked = {name: np.where(valid, z, np.nan) for name, z in heights.items()}
-    maps = {name: (("y", "x"), z, {"units": "m"}) for name, z in masked.items()}
+    dsm = np.fmax(dem, dsm)
+    dsm[~valid] = np.nan
+    heights = {"dem": np.where(valid, dem, np.nan), "dsm": dsm}
+    maps = {name: (("y", "x"), z, {"units": "m"}) for name, z in heights.items()}
     return xr.Dataset(maps, {axis: ground[axis].values for axis in ("y", "x")})
 
 
@@ -482,7 +487,7 @@ def _warn_of_shift(terrain: xr.Dataset) -> None:
     canopy = (terrain["dsm"] - terrain["dem"]).values
     canopy = canopy[np.isfinite(canopy)]
 
-    lowest = np.quantile(canopy, _LOWEST)
+    lowest = np.quantile(canopy, _LOWEST, overwrite_input=True)
     share = (canopy < lowest + _LEVEL).mean()
     if _SHIFTED < lowest <= _RAISED and share > _EQUAL:
         warn(

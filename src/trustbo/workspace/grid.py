@@ -289,17 +289,16 @@ class Grid(Summary):
         Returns:
             Means, shape (row, col); NaN where a cell has no finite value.
         """
-        row, col = self.cells_along(values["y"].values, values["x"].values)
-        cell = row[:, None] * self.shape[1] + col
-        z = values.transpose("y", "x").values
-
-        valid = np.isfinite(z)
-        total, count = (
-            np.bincount(cell[valid], weights, math.prod(self.shape)) for weights in (z[valid], None)
-        )
+        rows, cols = self.cells_along(values["y"].values, values["x"].values)
+        total = np.zeros(self.shape)
+        count = np.zeros(self.shape)
+        for row, z in zip(rows, values.transpose("y", "x").values, strict=True):
+            valid = np.isfinite(z)
+            np.add.at(total[row], cols[valid], z[valid])
+            np.add.at(count[row], cols[valid], 1.0)
 
         with np.errstate(invalid="ignore"):
-            return (total / count).reshape(self.shape)
+            return total / count
 
     def cells_along(self, y: ArrayLike, x: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the row of the cell at each `y` and the column of the cell at each `x`."""

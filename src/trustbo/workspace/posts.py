@@ -82,19 +82,13 @@ class Posts:
         self.surface = surface
         self.routes = Routes(surface)
 
-        easy = surface.passable if traversability is None else traversability
-        self._easy = np.nan_to_num(easy.astype(float))
-        for axis, side in enumerate(surface.pixel):
-            size = max(1, round(_SMOOTHED / side))
-            self._easy = ndimage.uniform_filter1d(self._easy, size, axis, mode="nearest")
-
         self._standable = largest_region(surface.passable)
         self._safe = self._standable & (surface.slope <= _SAFE * team.max_slope)
 
         # Cell row of each pixel row, and cell column of each pixel column.
         self._cells = grid.cells_along(*surface.axes)
 
-        self._central: dict[Cell, np.ndarray] = {}
+        self._central = self._central_stops(traversability)
         self._stops: dict[Cell, np.ndarray] = {}
         self._posts: dict[tuple[Cell, Cell | None], np.ndarray] = {}
 
@@ -178,8 +172,8 @@ class Posts:
 
         The lead looks for the first robot of T2; the heights of the others may differ.
         """
-        here = self._central_stop(cell)
-        around = [self._central_stop(c) for c in self._around(cell)]
+        here = self._central[cell]
+        around = [self._central[c] for c in self._around(cell)]
         goals = np.array([goal for goal in around if self._is_in_region(goal)])
         lattice = self._lattice(cell, here, _STOP_RADIUS)
         row, col = self.surface.nearest(*lattice.T)
@@ -192,17 +186,24 @@ class Posts:
         seen = self._seen(position[:, None], aims, self.team.lead, self.team.robots[0]).mean(1)
         return position[np.argmax(seen - _NEARER * np.linalg.norm(position - here, axis=1))]
 
-    def _central_stop(self, cell: Cell) -> np.ndarray:
-        """Find a position with high traversability near the cell's centre, (2,)."""
-        if cell not in self._central:
-            row, col = self._pixels_of(cell)
+    def _central_stops(self, traversability: np.ndarray | None) -> dict[Cell, np.ndarray]:
+        """Find a position with high traversability near the centre of each cell, (2,)."""
+        easy = self.surface.passable if traversability is None else traversability
+        easy = easy.astype(float)
+        np.nan_to_num(easy, copy=False)
+        for axis, side in enumerate(self.surface.pixel):
+            size = max(1, round(_SMOOTHED / side))
+            ndimage.uniform_filter1d(easy, size, axis, output=easy, mode="nearest")
 
+        stops = {}
+        size = np.hypot(self.grid.cell_height, self.grid.cell_width)
+        for cell in np.ndindex(self.grid.shape):
+            row, col = self._pixels_of(cell)
             position = self.surface.centers(row, col)
-            size = np.hypot(self.grid.cell_height, self.grid.cell_width)
             off_centre = np.linalg.norm(position - self.grid.center(cell), axis=1) / size
-            best = np.argmax(self._easy[row, col] - off_centre)
-            self._central[cell] = position[best].copy()  # not a view of all positions
-        return self._central[cell]
+            best = np.argmax(easy[row, col] - off_centre)
+            stops[cell] = position[best].copy()  # not a view of all positions
+        return stops
 
     # --- posts of T2 ---
 
@@ -402,10 +403,11 @@ class Posts:
         top, bottom = np.searchsorted(self._cells[0], (cell[0], cell[0] + 1))
         left, right = np.searchsorted(self._cells[1], (cell[1], cell[1] + 1))
 
-        anywhere = np.ones_like(self._standable)
-        for allowed in (self._standable, self.surface.passable, anywhere):
+        for allowed in (self._standable, self.surface.passable):
             row, col = np.nonzero(allowed[top:bottom, left:right])
             if len(row):
                 break
+        else:
+            row, col = (axis.ravel() for axis in np.indices((bottom - top, right - left)))
 
         return row + top, col + left

@@ -80,9 +80,11 @@ class Routes:
         Speed is relative to level ground. Pixels near obstacles have a larger pace.
         """
         if max_slope not in self._paces:
-            pace = 1.0 / speed_share(self._surface.slope, max_slope)
-            pace = np.where(self._is_close, _CLOSE * pace, pace)
-            self._paces[max_slope] = np.where(self._surface.passable, pace, np.inf)
+            pace = speed_share(self._surface.slope, max_slope)
+            np.divide(1.0, pace, out=pace)
+            pace[self._is_close] *= _CLOSE
+            pace[~self._surface.passable] = np.inf
+            self._paces[max_slope] = pace
         return self._paces[max_slope]
 
     def _search(

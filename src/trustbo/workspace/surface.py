@@ -23,8 +23,11 @@ class Surface(NamedTuple):
     @property
     def slope(self) -> np.ndarray:
         """Slope of the ground (row, col), rad; NaN where one of the 3 x 3 heights is missing."""
-        beside_missing = ndimage.binary_dilation(~np.isfinite(self.ground), np.ones((3, 3)))
-        return np.where(beside_missing, np.nan, np.arctan(np.hypot(*self.gradient)))
+        steepness = np.hypot(*self.gradient)
+        np.arctan(steepness, out=steepness)
+        missing = ~np.isfinite(self.ground)
+        steepness[ndimage.binary_dilation(missing, np.ones((3, 3)))] = np.nan
+        return steepness
 
     @property
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +89,11 @@ def surface_of(terrain: xr.Dataset, max_slope: float | None = None) -> Surface:
 
 def _filled(dem: np.ndarray) -> np.ndarray:
     """Replace missing heights with the nearest height, because robots may reach missing data."""
+    missing = ~np.isfinite(dem)
+    if not missing.any():
+        return dem
+
     nearest: Any = ndimage.distance_transform_edt(
-        ~np.isfinite(dem), return_distances=False, return_indices=True
+        missing, return_distances=False, return_indices=True
     )
     return dem[tuple(nearest)]
