@@ -16,6 +16,7 @@ from trustbo.workspace.moves import END, MOVES
 EAST = 4
 TILT = MEASURES.index("tilt")
 RNG = np.random.default_rng(0)
+SINGLE = 1e-7  # rasters are in single precision
 
 
 def behind_a_wall(gap):
@@ -36,7 +37,7 @@ def test_difficulty_is_that_of_the_largest_tilt_and_the_least_room():
         measured.append(workspace.difficulty.whole().values[EAST, 1, 1, EAST])
     for (_, tilt, narrow, tight), limit in zip(measured, (1.0, 0.4), strict=True):
         # Roll along the contour; no robot's way is but straight down, with the whole as pitch.
-        np.testing.assert_allclose(tilt, 0.3 / limit, rtol=1e-10)
+        np.testing.assert_allclose(tilt, 0.3 / limit, rtol=SINGLE)
         assert narrow == tight == 0.0  # no impassable pixel
     gaps = slice(20, 40), slice(28, 32)
     wide, slim = (behind_a_wall(gap).difficulty.whole().values for gap in gaps)
@@ -171,7 +172,7 @@ def measures_of(workspace, robot, route):
         away = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
     beside = (away[row, col] <= 1.001 * max(surface.pixel)).sum() * min(surface.pixel)
     return [
-        1.0 - np.nanmean(workspace.pixels["traversability"].values[row, col]),
+        1.0 - np.nanmean(workspace.pixels["traversability"].values[row, col].astype(float)),
         min(2.0, largest_tilt(surface, robot, route) / math.tan(robot.max_slope)),
         1.0 / (1.0 + away[row, col].min() / 2.0),
         math.log1p(beside) / 3.0,
@@ -211,7 +212,7 @@ def test_difficulty_is_that_of_routes_by_networkx_and_of_a_plain_drive():
             ]
             worst.append(np.max(of_robots, axis=0))
         expected = averaged(np.array(worst), np.round(np.array(worst)[:, TILT], 9))
-        np.testing.assert_allclose(measured[move, row, col, nexts], expected, atol=1e-9)
+        np.testing.assert_allclose(measured[move, row, col, nexts], expected, atol=SINGLE)
 
 
 @pytest.mark.parametrize("gap", [slice(0, 0), slice(20, 40), slice(28, 32)])

@@ -41,7 +41,8 @@ def pixel_maps(
     name, as from `options_of`.
 
     Returns:
-        A dataset (y, x) of each feature, in [0, 1], and the fitted composite indices.
+        A dataset (y, x) of each feature, in [0, 1] and in single precision to save memory, and the
+        fitted composite indices.
 
     Raises:
         TrustboError: A feature is unknown, does not return a number for each pixel, has a name that
@@ -70,7 +71,8 @@ def pixel_maps(
 
     for name, parts in features.items():
         if isinstance(parts, str):
-            values = pixels[name] = without_rounding(values_of(parts))
+            values = without_rounding(values_of(parts))
+            pixels[name] = values.astype(np.float32)
             low = np.nanmin(values, initial=0.0)
             high = np.nanmax(values, initial=1.0)
             if low < 0.0 or high > 1.0:
@@ -85,9 +87,10 @@ def pixel_maps(
         parts_of = {part: values_of(part) for part in names}
 
         index = CompositeIndex({part: FEATURES[part].sign for part in parts_of}).fit(parts_of)
-        pixels[name] = np.ascontiguousarray(index.transform(parts_of))  # as kernels need it
+        values = index.transform(parts_of)
+        pixels[name] = np.ascontiguousarray(values, np.float32)  # as kernels need it
         composites[name] = index
-        del parts_of  # rasters, which the next feature would otherwise add to
+        del parts_of, values  # rasters, which the next feature would otherwise add to
 
     dem = terrain["dem"]
     maps = {

@@ -173,7 +173,7 @@ class Difficulty:
         """Traversability of each pixel, NaN where unknown."""
         if self._traversability is not None:
             return plain(self._traversability)
-        return np.full(cast("Posts", self._posts).routes.room.shape, np.nan)
+        return np.full_like(cast("Posts", self._posts).routes.room, np.nan)
 
 
 @_compiled

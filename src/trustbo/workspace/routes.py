@@ -35,8 +35,8 @@ class Routes:
     """Fastest routes over passable pixels, found by A* and cached.
 
     Attributes:
-        room: Distance of each pixel to the nearest impassable one (row, col), m; inf if there is
-            none.
+        room: Distance of each pixel to the nearest impassable one (row, col), m, in single
+            precision; inf if there is none.
     """
 
     def __init__(self, surface: Surface) -> None:
@@ -45,7 +45,9 @@ class Routes:
 
         free: Any = ndimage.distance_transform_edt(surface.passable, sampling=surface.pixel)
         self._is_close = free <= max(_CLEARANCE, *surface.pixel)
-        self.room = np.full(free.shape, np.inf) if surface.passable.all() else free
+        self.room = free.astype(np.float32)
+        if surface.passable.all():
+            self.room[:] = np.inf
         self._paces: dict[float, np.ndarray] = {}
         self._cached: dict[tuple[object, ...], np.ndarray] = {}
 

@@ -15,7 +15,7 @@ class Surface(NamedTuple):
 
     ground: np.ndarray  # (row, col), m
     canopy: np.ndarray  # (row, col), m: the DSM
-    gradient: np.ndarray  # (2, row, col): dz/dx and dz/dy
+    gradient: np.ndarray  # (2, row, col): dz/dx and dz/dy, in single precision to save memory
     passable: np.ndarray  # (row, col), bool
     pixel: tuple[float, float]  # height, width of a pixel, m
     origin: tuple[float, float]  # x, y of the centre of pixel (0, 0)
@@ -76,7 +76,7 @@ def surface_of(terrain: xr.Dataset, max_slope: float | None = None) -> Surface:
     surface = Surface(
         ground=ground,
         canopy=canopy,
-        gradient=horn_gradient(_filled(ground), pixel),
+        gradient=horn_gradient(_filled(ground), pixel).astype(np.float32),
         passable=np.isfinite(ground),
         pixel=pixel,
         origin=(float(terrain["x"][0]), float(terrain["y"][0])),

@@ -58,7 +58,7 @@ class Workspace(Summary):
         grid: Shape, position and cell size of the planning grid.
         team: Lead and overwatching robots.
         terrain: Dataset of the DEM and the DSM; None if the workspace was made from arrays.
-        pixels: Dataset (y, x) of each feature and of `passable`; None without a terrain.
+        pixels: Dataset (y, x) of each feature, float32, and of `passable`; None without a terrain.
         composites: Fitted composite indices, keyed by feature.
         posts: The robots' stops, posts and routes on the terrain; None without a terrain.
 
