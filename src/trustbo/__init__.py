@@ -19,7 +19,7 @@ def __getattr__(name: str) -> object:
 
     from trustbo.display import announced
 
-    with announced("Loading libraries (a few seconds)."):
+    with announced(f"Loading libraries for trustbo.{name} (a few seconds)."):
         found = _getattr(name)
     globals()[name] = found  # the next use of the name does not come here
     return found

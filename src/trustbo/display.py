@@ -17,7 +17,7 @@ Rows = list[tuple[str, str]]
 """Names and values, with units, of the main properties of an object."""
 _WIDTH = 100
 _MAX_LINES = 3  # per property
-_PATIENCE = 2.0  # seconds of work before a progress bar or a line appears
+_PATIENCE = 1.5  # seconds of work before a progress bar or a line appears
 
 
 class Summary:
@@ -72,7 +72,7 @@ def joined(names: Sequence[str]) -> str:
 
 
 def slow_bar(name: str, unit: str, shown: bool, *, total: int | None = None) -> tqdm:
-    """Make a progress bar that appears only if the work takes longer than 2 seconds."""
+    """Make a progress bar that appears only if the work takes longer than `_PATIENCE`."""
     return bar(shown, desc=name, unit=unit, total=total, delay=_PATIENCE, leave=False)
 
 
@@ -116,7 +116,7 @@ def refreshing(shown: tqdm, step: int = 0) -> Iterator[None]:
 
 @contextmanager
 def announced(text: str) -> Iterator[None]:
-    """Print a line if the block takes longer than 2 seconds; each text is printed once."""
+    """Print a line if the block takes longer than `_PATIENCE`; each text is printed once."""
     timer = threading.Timer(_PATIENCE, say_once, [text])
     timer.daemon = True
     timer.start()

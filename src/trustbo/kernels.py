@@ -63,13 +63,15 @@ def _store(made: Any) -> None:
 
 
 class _Announcement(event.Listener):
-    """Announces the first compilation of a kernel of this package."""
+    """Announces the first compilation of a kernel of each subpackage."""
 
     def on_start(self, event: event.Event) -> None:
         details: Any = event.data
         function = details["dispatcher"].py_func
-        if str(function.__module__).startswith("trustbo."):  # None in a namespace of its own
-            say_once("First use: compiling kernels (about 30 s, stored for later).")
+        package, _, module = str(function.__module__).partition(".")  # None in another namespace
+        if package == "trustbo":
+            room = module.partition(".")[0]
+            say_once(f"First use: compiling kernels of trustbo.{room} (stored for later).")
 
     def on_end(self, event: event.Event) -> None:
         pass

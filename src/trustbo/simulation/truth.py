@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell
-from trustbo.display import Rows, Summary
+from trustbo.display import Rows, Summary, announced
 from trustbo.errors import OldName, TrustboError, require_count, require_whole
 from trustbo.files import FilePath, to_json, to_path, write_file
 from trustbo.models.backend import VERSIONS
@@ -120,7 +120,8 @@ class Truth(Summary):
             world = to_json([settings, known, n_replicates, seed])
             if world not in found:
                 make = partial(replicated, simulator, number, n_replicates, seed)
-                found[world] = cls(workspace, _cached(folder, world, make), of_mission)
+                with announced("Simulating all bounds for their truth (minutes on large grids)."):
+                    found[world] = cls(workspace, _cached(folder, world, make), of_mission)
             return found[world]
 
         return of_mission(mission)
