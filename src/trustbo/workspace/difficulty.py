@@ -19,7 +19,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from trustbo.display import slow_bar
+from trustbo.display import announced, slow_bar
 from trustbo.kernels import kernel, part
 from trustbo.parallel import in_order, plain
 from trustbo.workspace.moves import END, MOVES, possible_next
@@ -120,7 +120,11 @@ class Difficulty:
     def _measure(self, bounds: np.ndarray) -> None:
         """Measure the given bounds (bound, 3), which exist and have a terrain."""
         blocks = [np.array(block) for block in batched(bounds, _BLOCK)]
-        with slow_bar("difficulty of bounds", "bound", True, total=len(bounds)) as progress:
+        shown = slow_bar("difficulty of bounds", "bound", True, total=len(bounds))
+        with (
+            announced("Measuring the difficulty of bounds (minutes on large grids)."),
+            shown as progress,
+        ):
             measured = in_order(self._of_block, blocks)
             for block, values in zip(blocks, measured, strict=True):
                 index = tuple(block.T)
