@@ -57,9 +57,27 @@ def test_the_mean_weight_of_draws_is_that_of_quadrature(name, family, y):
     posterior.run_ep(posterior.theta(z))
     many = np.repeat(z, n, axis=0)
     log_p = posterior.scores.log_prior(many) + wanted
-    _, log_weight = posterior.draw_by_ep(many, log_p, np.random.default_rng(0), 1)
-    weight = np.exp(log_weight)
+
+    rng = np.random.default_rng(0)
+    _, coefficients = posterior.visit(many, rng)
+    c, log_q = coefficients.propose(np.arange(n), rng)
+    weight = np.exp(posterior.log_weight(many, c, rng) - log_q - log_p)
     assert abs(weight.mean() - 1.0) < 5.0 * weight.std() / np.sqrt(n) + 2e-3
+
+
+@pytest.mark.parametrize("family", ["censored", "beta_binomial"])
+@pytest.mark.parametrize("name", MODELS)
+def test_the_density_near_the_theta_of_ep_is_that_of_ep(name, family):
+    posterior, z, _ = small(name, family, PAIRS[0])
+    posterior.run_ep(posterior.theta(z))
+
+    shift = np.random.default_rng(1).standard_normal((8, z.shape[1]))
+    for size, error in (0.0, 1e-6), (0.3, 0.02):
+        near = z + size * shift
+        ep_density = posterior.log_evidence(posterior.theta(near)) + posterior.scores.log_prior(
+            near
+        )
+        np.testing.assert_allclose(posterior.log_density(near), ep_density, atol=error)
 
 
 def people(scale, change=None):

@@ -4,10 +4,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from scipy import sparse
+from scipy import sparse, special
 
 from trustbo.inference import ep, gradient
-from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, evidence
+from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, evidence, expected
 from trustbo.inference.importance import Student, climb
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
@@ -33,14 +33,18 @@ _LARGEST_NOISE = 50.0
 """Largest size of the noises whose density is computed; see `NormalScores`."""
 _LEAST_NOISE = 1e-6
 """Smallest size of the noises whose density is computed."""
-SWEEPS = 1
-"""Number of EP sweeps at each point, beginning with the sites at the mode."""
+_SWEEPS = 1
+"""Number of EP sweeps at each point for an evidence, beginning with the sites at the mode."""
 _SETTLED = 12
 """Number of EP sweeps that find the sites at the mode."""
 _DAMPING = 0.7
 """Damping of the EP sweeps that find the sites at the mode."""
 _DEVIATIONS = 4
 """Number of draws of the coefficients that are kept at each visited point."""
+_LEAST_DEGREES = 8.0
+"""Smallest number of degrees of freedom of a proposal of coefficients."""
+_SQUARED = 3.0
+"""Squared number of columns per degree of freedom of a proposal of coefficients."""
 _WIDER = 1.5
 """Factor on the covariance of the core scores in the defensive proposal."""
 _PRIOR_VARIANCE = 1.2
@@ -48,16 +52,14 @@ _PRIOR_VARIANCE = 1.2
 
 
 class JointDraws(NamedTuple):
-    """Draws of hyperparameters, coefficients and, unless rates are Gaussian, predictors."""
+    """Draws of hyperparameters and coefficients."""
 
     theta: dict[str, np.ndarray]  # (draw, ...)
     c: np.ndarray  # (draw, column)
-    f: np.ndarray | None = None  # (draw, block, row)
 
     def at(self, index: np.ndarray) -> Self:
         """Select draws by index."""
-        f = None if self.f is None else self.f[index]
-        return self._replace(theta=at(self.theta, index), c=self.c[index], f=f)
+        return self._replace(theta=at(self.theta, index), c=self.c[index])
 
 
 class Coefficients(NamedTuple):
@@ -65,6 +67,15 @@ class Coefficients(NamedTuple):
 
     mean: np.ndarray  # (point, column)
     deviation: np.ndarray  # (point, deviation, column), independent draws minus the mean
+    gram: np.ndarray  # (point, deviation, deviation), products of the whitened deviations
+    log_det: np.ndarray  # (point,), of the factor of the precision
+
+    @classmethod
+    def empty(cls, n_points: int, n_columns: int) -> Self:
+        """Make room for the distributions at n points."""
+        k = _DEVIATIONS
+        shapes = (n_columns,), (k, n_columns), (k, k), ()
+        return cls(*(np.zeros((n_points, *shape)) for shape in shapes))
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
@@ -77,13 +88,37 @@ class Coefficients(NamedTuple):
         A combination of independent deviations with a random unit vector has the same normal
         distribution as each deviation, so a point can be drawn any number of times.
         """
-        unit = rng.standard_normal((len(index), self.deviation.shape[1]))
-        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        return self._combined(index, self._directions(len(index), rng))
 
+    def propose(self, index: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw coefficients from Student-t distributions; also return log densities (draw,).
+
+        These distributions have the means and precisions of the normal distributions. The fewer
+        columns, the heavier their tails, which cover the errors of EP.
+        """
+        p = self.mean.shape[1]
+        nu = max(_LEAST_DEGREES, p**2 / _SQUARED)
+        unit = self._directions(len(index), rng)
+        unit /= np.sqrt(rng.chisquare(nu, (len(index), 1)) / nu)
+
+        square = np.einsum("ni,nij,nj->n", unit, self.gram[index], unit)
+        log_q = special.gammaln(0.5 * (nu + p)) - special.gammaln(0.5 * nu)
+        log_q = log_q - 0.5 * p * np.log(nu * np.pi) + self.log_det[index]
+        log_q = log_q - 0.5 * (nu + p) * np.log1p(square / nu)
+        return self._combined(index, unit), log_q
+
+    def _directions(self, n: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw random unit vectors (draw, deviation)."""
+        unit = rng.standard_normal((n, self.deviation.shape[1]))
+        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        return unit
+
+    def _combined(self, index: np.ndarray, factors: np.ndarray) -> np.ndarray:
+        """Add the sums of the deviations times factors (draw, deviation) to the means."""
         drawn = self.mean[index]
         for point in np.unique(index):
             here = index == point
-            drawn[here] += unit[here] @ self.deviation[point]
+            drawn[here] += factors[here] @ self.deviation[point]
         return drawn
 
 
@@ -132,35 +167,39 @@ class Density:
         return self.model.theta(self.scores.values(z), self.observations.resolution)
 
     def log_density(self, z: Any) -> Any:
-        """Compute the unnormalised log posterior density (point,) of scores (point, score)."""
+        """Compute the unnormalised log posterior density (point,) of scores (point, score).
+
+        Unless rates are Gaussian, the density is that of EP near the theta of `run_ep`, in the
+        approximation of `ep.nearby`.
+        """
         if namespace(z) is not np:
             return self.log_evidence(self.theta(z)) + self.scores.log_prior(z)
 
         log_p = np.full(len(z), -np.inf)
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
             theta, log_prior, some = self._possible(z)
-            log_p[some] = self.log_evidence(theta) + log_prior
+            for where, chunk in chunks(theta, self._n_at_once):
+                fit, _ = self._fit(chunk)
+                log_p[some[where]] = fit.log_p
+            log_p[some] += log_prior
         return np.where(np.isfinite(log_p), log_p, -np.inf)
 
     def visit(self, z: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Coefficients]:
-        """Compute the log density and the coefficients at each point, given Gaussian rates."""
-        n_points = len(z)
-        n_columns = self._U.shape[1]
-        log_p = np.full(n_points, -np.inf)
-        mean = np.zeros((n_points, n_columns))
-        deviation = np.zeros((n_points, _DEVIATIONS, n_columns))
+        """Compute the log density of `log_density` and the coefficients at each point."""
+        log_p = np.full(len(z), -np.inf)
+        found = Coefficients.empty(len(z), self._U.shape[1])
 
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
             theta, log_prior, some = self._possible(z)
             for where, chunk in chunks(theta, self._n_at_once):
                 fit, prior = self._fit(chunk)
                 log_p[some[where]] = fit.log_p
-                mean[some[where]], deviation[some[where]] = coefficients_of(
-                    prior, fit, _DEVIATIONS, rng
-                )
+                parts = coefficients_of(prior, fit, _DEVIATIONS, rng)
+                for values, part in zip(found, (*parts, fit.F.log_det), strict=True):
+                    values[some[where]] = part
             log_p[some] += log_prior
 
-        return np.where(np.isfinite(log_p), log_p, -np.inf), Coefficients(mean, deviation)
+        return np.where(np.isfinite(log_p), log_p, -np.inf), found
 
     def _possible(self, z: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
         """Return hyperparameters, log priors and indices where the density may be positive."""
@@ -191,7 +230,7 @@ class Density:
                 log_p[where] = fit.log_p
             else:
                 joint = self._joint(chunk)
-                sites = ep.swept(joint, self.sites, SWEEPS)
+                sites = ep.swept(joint, self.sites, _SWEEPS)
                 log_p[where] = ep.log_evidence(joint, sites)
         return log_p
 
@@ -199,12 +238,15 @@ class Density:
         """Forget the EP sites, so that results do not depend on earlier computations."""
         if not self.exact:
             self.sites = ep.first_sites(self.rates)
+            self.predicted = ep.first_predictions(self.rates)
 
     def run_ep(self, theta: Theta) -> None:
-        """Find the EP sites at the mean of theta, for use as initial sites at all other points."""
+        """Find the EP sites at the mean of theta, and the predictions of rates for other points."""
         if not self.exact:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
-            self.sites = ep.swept(self._joint(center), self.sites, _SETTLED, _DAMPING)
+            joint = self._joint(center)
+            self.sites = ep.swept(joint, self.sites, _SETTLED, _DAMPING)
+            self.predicted = ep.predictions(joint, self.sites)
 
     def start(self) -> np.ndarray:
         """Return a starting point for the search for the mode or, with EP, the mode itself.
@@ -220,7 +262,7 @@ class Density:
             best = self._best_of_four_starts()
 
         if not self.exact:
-            # The EP evidence depends on the initial sites, which should be those at the mode.
+            # The approximate density is most accurate near the theta of `run_ep`.
             self.run_ep(self.theta(best[None]))
             best = climb(self.log_density, best)
             self.run_ep(self.theta(best[None]))
@@ -251,36 +293,33 @@ class Density:
         cov[others, others] = _PRIOR_VARIANCE
         return Student(center, np.linalg.cholesky(cov))
 
-    def draw_by_ep(
-        self, z: np.ndarray, log_p: np.ndarray, rng: np.random.Generator, n_sweeps: int
-    ) -> tuple[JointDraws, np.ndarray]:
-        """Draw coefficients and linear predictors once at each of the equally weighted points.
+    def log_weight(self, z: np.ndarray, c: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Estimate the log joint density (draw,) of scores, coefficients and rates.
+
+        The linear predictors are drawn and weighted, so that the mean of the estimated densities is
+        exact.
 
         Args:
-            z: Normal scores (point, score).
-            log_p: Log density (point,) of the scores, computed with EP.
+            z: Normal scores (draw, score).
+            c: Coefficients (draw, column).
             rng: Random number generator.
-            n_sweeps: Number of EP sweeps at each point.
-
-        Returns:
-            The draws, and the log weights (point,) that correct the errors of EP.
         """
         theta = self.theta(z)
-        parts = []
-        for _, chunk in chunks(theta):
+        log_p = self.scores.log_prior(z)
+        for where, chunk in chunks(theta):
             joint = self._joint(chunk)
-            sites = ep.swept(joint, self.sites, n_sweeps)
-            parts.append(ep.draw(joint, sites, rng))
-
-        c, f, log_weight = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return JointDraws(theta, c, f), log_weight + self.scores.log_prior(z) - log_p
+            at = expected(self.blocks, joint.predictor, c[where])
+            sites = ep.nearby_sites(joint, self.predicted)
+            _, log_block = ep.draw_predictors(joint, at, sites, rng)
+            log_p[where] += joint.prior.log_density(c[where]) + log_block.sum(1)
+        return log_p
 
     def draw_coefficients(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
         """Draw the coefficients (point, column) once at each point, given Gaussian rates."""
         drawn = []
         for _, chunk in chunks(theta):
             fit, prior = self._fit(chunk)
-            mean, deviation = coefficients_of(prior, fit, 1, rng)
+            mean, deviation, _ = coefficients_of(prior, fit, 1, rng)
             drawn.append(mean + deviation[:, 0])
         return np.concatenate(drawn)
 
@@ -291,10 +330,13 @@ class Density:
         )
 
     def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
-        """Compute the evidence of Gaussian rates at each theta; also return the prior."""
+        """Compute the evidence at each theta, as in `log_density`; also return the prior."""
+        if not self.exact:
+            joint = self._joint(theta)
+            return ep.nearby(joint, self.predicted), joint.prior
+
         predictor, prior = self._at(theta)
-        fit = evidence(self.blocks, predictor, prior, self.site_precision(predictor))
-        return fit, prior
+        return evidence(self.blocks, predictor, prior, self.site_precision(predictor)), prior
 
     def _at(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
         """Return the distribution of the linear predictors and the prior at each theta."""

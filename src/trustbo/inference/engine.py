@@ -355,14 +355,15 @@ def expected(blocks: Blocks, predictor: LinearPredictor, c: Any) -> Any:
 
 def coefficients_of(
     prior: Prior, fit: Fit, n: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return posterior means (point, column) and n deviations (point, n, column) of coefficients.
 
-    Deviations are independent draws from the normal posterior at each point, minus its mean.
+    Deviations are independent draws from the normal posterior at each point, minus its mean. Also
+    returns the products (point, n, n) of the whitened deviations.
     """
     white = rng.standard_normal((len(fit.half), n, fit.half.shape[1]))
     found = fit.F.back(np.concatenate([fit.half[:, None], white], axis=1))
-    return prior.mean + found[:, 0], found[:, 1:]
+    return prior.mean + found[:, 0], found[:, 1:], white @ white.swapaxes(1, 2)
 
 
 def covariance_of_inputs(blocks: Blocks, covariance: np.ndarray, n_inputs: int) -> np.ndarray:

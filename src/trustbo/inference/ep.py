@@ -5,18 +5,18 @@ computes the marginals of the linear predictors exactly. Dividing a marginal by 
 cavity. The site is then updated to match moments: the product of the cavity and the new site has
 the same moments as the product of the cavity and the likelihood term (Minka 2001; Rasmussen and
 Williams 2006, section 3.6). The log evidence is the log evidence of the sites plus, for each term,
-the log ratio of the masses of these products. Importance weights correct the draws for the error of
-EP.
+the log ratio of the masses of these products.
+
+Sweeps over all sites run at one theta only. From there, `nearby` finds the sites at other theta,
+which takes a single factorisation. Importance weights correct the draws for the errors.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from scipy import special
 
-from trustbo.inference.engine import Blocks, Prior, evidence, expected, marginals, whiten
+from trustbo.inference.engine import Blocks, Fit, Prior, evidence, marginals, whiten
 from trustbo.inference.factor import cholesky
-from trustbo.inference.sparse import Factor
 from trustbo.models.families import Family
 from trustbo.models.families.moments import log_normal
 from trustbo.statespace.blocks import LinearPredictor, each
@@ -29,10 +29,8 @@ _VAGUE_SD = 0.3
 """Sd of trust, on the scale of rates, under which the initial sites are matched."""
 _USUAL_NOISE = 0.2
 """Sd of the observation noise with which the initial sites are matched."""
-_TEMPERED = 0.6
-"""Factor on the site precisions in the wider proposal."""
-_LEAST_DEGREES = 8.0
-"""Smallest number of degrees of freedom of a proposal of coefficients."""
+_LEAST_SHARE = 0.05
+"""Smallest share of the predictor in the variance of a prediction."""
 _JITTER = 1e-12
 """Number added to the covariance of the predictors of a block."""
 
@@ -78,16 +76,73 @@ class Sites(NamedTuple):
         return Sites(*np.broadcast_arrays(lam, eta))
 
 
+class Predictions(NamedTuple):
+    """Normal distributions (1, block, row) of predictors plus noise, given all other rates."""
+
+    mean: np.ndarray
+    var: np.ndarray
+
+
+def first_predictions(rates: Rates) -> Predictions:
+    """Make initial predictions from a vague distribution of trust."""
+    unit, zero = rates.likelihood.line_of_sight
+    shape = 1, *rates.y.shape
+    var = (_VAGUE_SD * unit) ** 2 + _USUAL_NOISE**2
+    return Predictions(np.full(shape, unit * (0.5 - zero)), np.full(shape, var))
+
+
 def first_sites(rates: Rates) -> Sites:
     """Make initial sites (1, block, row), matched under a vague distribution of trust."""
-    unit, zero = rates.likelihood.line_of_sight
-    y = rates.y
-    m = np.full(y.shape, unit * (0.5 - zero))
-    v = np.full(y.shape, (_VAGUE_SD * unit) ** 2)
-    noise = np.full(y.shape, _USUAL_NOISE)
+    sd = np.full((1, 1, 1), _USUAL_NOISE)
+    return _sites_of(rates, first_predictions(rates), sd)[0]
 
-    _, mean, var = rates.likelihood.moment_match(y, rates.n_ticks, m, v, noise)
-    return _matched(rates, 1.0 / v[None], m / v, mean, var)
+
+def predictions(joint: Joint, sites: Sites) -> Predictions:
+    """Predict each rate from all others, given the sites at one theta."""
+    _, cavity = _cavities(joint, sites)
+    return Predictions(cavity.mean, cavity.var + joint.predictor.noise_sd**2)
+
+
+def nearby(joint: Joint, predicted: Predictions) -> Fit:
+    """Approximate EP at each theta, given the predictions at another theta.
+
+    The log evidence of EP is stationary in the sites and in the cavities (Minka 2001). Therefore,
+    errors of the cavities change it only to second order. The predictions of rates change less with
+    theta than the cavities, because the data determine the sum of the variances of trust and noise.
+    """
+    blocks, predictor, prior, rates = joint
+    sites, log_ratio = _sites_of(rates, predicted, predictor.noise_sd)
+    fit = evidence(blocks, predictor, prior, sites.lam, sites.y)
+    return fit._replace(log_p=fit.log_p + log_ratio)
+
+
+def nearby_sites(joint: Joint, predicted: Predictions) -> Sites:
+    """Return the sites of `nearby`."""
+    return _sites_of(joint.rates, predicted, joint.predictor.noise_sd)[0]
+
+
+def _sites_of(rates: Rates, predicted: Predictions, sd: np.ndarray) -> tuple[Sites, np.ndarray]:
+    """Match the sites at each noise sd, given predictions; return the log ratio (point,) of masses.
+
+    The ratio is that of the cavities times the likelihood terms, and times the sites.
+    """
+    m, total = predicted
+    v = np.maximum(total - sd**2, _LEAST_SHARE * total)
+    m = np.broadcast_to(m, v.shape)
+    log_mass, mean, var = rates.likelihood.moment_match(rates.y, rates.n_ticks, m, v, sd)
+
+    precision = 1.0 / v
+    var = np.maximum(var, _LEAST_VARIANCE)
+    sites = _matched(rates, precision, m * precision, mean, var).at(rates, sd)
+    return sites, _log_ratio(rates, sites, log_mass, m, v)
+
+
+def _log_ratio(
+    rates: Rates, sites: Sites, log_mass: np.ndarray, m: np.ndarray, v: np.ndarray
+) -> np.ndarray:
+    """Sum the log ratios (point,) of the masses of N(f; m, v) times terms and sites (3.65)."""
+    ratio = log_mass - _overlap(sites.y, sites.lam, m, v)
+    return np.where(np.isnan(rates.y), 0.0, ratio).sum((1, 2))
 
 
 def _matched(
@@ -122,17 +177,14 @@ def swept(joint: Joint, sites: Sites, n_sweeps: int, damp: float = 1.0) -> Sites
 def log_evidence(joint: Joint, sites: Sites) -> np.ndarray:
     """Compute the EP log evidence (point,) with the given sites."""
     rates = joint.rates
-    seen = ~np.isnan(rates.y)
     sd = joint.predictor.noise_sd
     sites = sites.at(rates, sd)
     log_sites, cavity = _cavities(joint, sites)
 
-    # The ratio of the masses of the cavity times the likelihood term and times the site (3.65).
     m = cavity.mean
     v = cavity.var
     log_mass, _, _ = rates.likelihood.moment_match(rates.y, rates.n_ticks, m, v, sd)
-    ratio = log_mass - _overlap(sites.y, sites.lam, m, v)
-    return log_sites + np.where(seen, ratio, 0.0).sum((1, 2))
+    return log_sites + _log_ratio(rates, sites, log_mass, m, v)
 
 
 class _Cavities(NamedTuple):
@@ -168,45 +220,6 @@ def _overlap(y: np.ndarray, lam: np.ndarray, m: np.ndarray, v: np.ndarray) -> np
     some = lam > 0.0
     total = v + 1.0 / np.where(some, lam, 1.0)
     return np.where(some, log_normal(y - m, total), 0.0)
-
-
-def draw(
-    joint: Joint, sites: Sites, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw coefficients and predictors at each theta, with weights whose mean is the evidence.
-
-    Coefficients are drawn from a mixture of two Student-t distributions, one centred on the
-    EP posterior and one on a posterior with less precise sites.
-
-    Returns:
-        Coefficients (point, column), linear predictors (point, block, row) and log weights
-        (point,).
-    """
-    blocks, predictor, prior, rates = joint
-    n_points = len(predictor.noise_sd)
-    n_columns = blocks.U.shape[1]
-    nu = max(_LEAST_DEGREES, 2.0 * n_columns)
-
-    proposals = []
-    for share in (1.0, _TEMPERED):
-        lam = np.where(rates.linear, 1.0, share) * sites.lam
-        fit = evidence(blocks, predictor, prior, lam, sites.y)
-        center = prior.mean + fit.F.back(fit.half[:, None])[:, 0]
-        proposals.append((center, fit.F))
-
-    is_wide = rng.random(n_points) < 0.5
-    _, F = proposals[0]
-    t = rng.standard_normal((n_points, 1, F.size))
-    t /= np.sqrt(rng.chisquare(nu, (n_points, 1, 1)) / nu)
-    narrow, wide = (center + F.back(t)[:, 0] for center, F in proposals)
-    c = np.where(is_wide[:, None], wide, narrow)
-
-    # The density is that of the mixture, regardless of which part was drawn from.
-    of_narrow, of_wide = (_log_student(c, center, F, nu) for center, F in proposals)
-    log_q = np.logaddexp(of_narrow, of_wide) - np.log(2.0)
-
-    f, log_block = draw_predictors(joint, expected(blocks, predictor, c), sites, rng)
-    return c, f, prior.log_density(c) - log_q + log_block.sum(1)
 
 
 def draw_predictors(
@@ -263,13 +276,3 @@ def draw_predictors(
         ratio = log_mass - _overlap(y[..., k], lam[..., k], m, v)
         log_weight = log_weight + np.where(is_exact, 0.0, ratio)
     return f, log_weight
-
-
-def _log_student(c: np.ndarray, center: np.ndarray, F: Factor, nu: float) -> np.ndarray:
-    """Compute the log density of a Student-t distribution; F factors the precision matrix."""
-    p = c.shape[1]
-    z = F.whitened(c - center)
-
-    constant: Any = special.gammaln(0.5 * (nu + p)) - special.gammaln(0.5 * nu)
-    constant = constant - 0.5 * p * np.log(nu * np.pi)
-    return constant + F.log_det - 0.5 * (nu + p) * np.log1p((z**2).sum(1) / nu)

@@ -20,7 +20,7 @@ from trustbo.errors import (
     require_kind,
     require_whole,
 )
-from trustbo.inference.density import SWEEPS, Coefficients, Density, JointDraws
+from trustbo.inference.density import Coefficients, Density, JointDraws
 from trustbo.inference.draws import as_fitted, names_in, require_fitted
 from trustbo.inference.functions.fit import (
     fit_function,
@@ -32,7 +32,6 @@ from trustbo.inference.functions.sampling import AUTO
 from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
 from trustbo.inference.importance import (
     MAX_KHAT,
-    LogDensity,
     Points,
     Student,
     sample,
@@ -73,8 +72,6 @@ _SIZE = 256
 """Points per round of the importance sampler."""
 _LAST_SIZE = 1024
 """Points per round of the last attempt."""
-_LAST_SWEEPS = 4
-"""EP sweeps at each point in the last attempt; usually `SWEEPS`."""
 _MANY_SCORES = 12
 """Smallest number of scores for which a round has four times as many points."""
 
@@ -348,30 +345,33 @@ def by_importance(
     found by a search for the mode.
     """
     rng = np.random.default_rng(seed)
-    draw = _exact_draws if density.exact else _ep_draws
-
-    attempts = [(_SIZE, SWEEPS, None), (_LAST_SIZE, _LAST_SWEEPS, None)]
+    attempts = [(_SIZE, None), (_LAST_SIZE, None)]
     if first:
-        attempts = [(_SIZE, SWEEPS, first), *attempts]
+        attempts = [(_SIZE, first), *attempts]
     while True:
-        size, n_sweeps, proposal = attempts.pop(0)
+        size, proposal = attempts.pop(0)
         if density.n_scores >= _MANY_SCORES:
             size = 4 * size
 
-        drawn, log_p, summary = draw(density, n, size, n_sweeps, rng, proposal)
+        drawn, log_p, summary = _draws(density, n, size, rng, proposal)
         if summary["k_hat"] <= MAX_KHAT or not attempts:
             return drawn, {"lp": log_p}, summary
 
 
-def _exact_draws(
+def _draws(
     density: Density,
     n: int,
     size: int,
-    n_sweeps: int,
     rng: np.random.Generator,
     first: Student | None,
 ) -> tuple[JointDraws, np.ndarray, dict[str, Any]]:
-    """Take n draws given Gaussian rates, for which the log density of scores is exact."""
+    """Take n draws, beginning with the proposal `first` or with a search for the mode."""
+    if first is None:
+        start = density.start()
+    else:
+        start = first.center
+        density.run_ep(density.theta(start[None]))
+
     visited: list[Coefficients] = []
 
     def visit(z: np.ndarray) -> np.ndarray:
@@ -379,31 +379,36 @@ def _exact_draws(
         visited.append(coefficients)
         return log_p
 
-    points = _points(density, size, rng, first, visit)
-    chosen = points.resample(n, rng)
-
-    c = Coefficients.joined(visited).draw(chosen, rng)
-    drawn = JointDraws(density.theta(points.z[chosen]), c)
-
+    points = sample(
+        density.log_density, start[None], rng,
+        size=size, defensive=density.defensive, first=first, visit=visit,
+    )  # fmt: skip
+    coefficients = Coefficients.joined(visited)
     summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
-    return drawn, points.log_p[chosen], summary | {"proposal": points.proposal.text}
+    summary["proposal"] = points.proposal.text
+
+    if density.exact:
+        chosen = points.resample(n, rng)
+        c = coefficients.draw(chosen, rng)
+    else:
+        chosen, c, corrected = _corrected(density, points, coefficients, n, size, rng)
+        summary |= corrected
+    return JointDraws(density.theta(points.z[chosen]), c), points.log_p[chosen], summary
 
 
-def _ep_draws(
+def _corrected(
     density: Density,
+    points: Points,
+    coefficients: Coefficients,
     n: int,
     size: int,
-    n_sweeps: int,
     rng: np.random.Generator,
-    first: Student | None,
-) -> tuple[JointDraws, np.ndarray, dict[str, Any]]:
-    """Take n draws given other rates, with weights that correct the EP density of the scores."""
-    points = _points(density, size, rng, first)
-
-    # Correcting EP at these points takes most of the time, but more points make k-hat more
-    # reliable.
+) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
+    """Correct draws for the errors of EP; return points, coefficients and a summary."""
+    # The more draws are corrected, the more reliable is k-hat.
     some = points.resample(_CORRECTED * size, rng)
-    drawn, log_ratio = density.draw_by_ep(points.z[some], points.log_p[some], rng, n_sweeps)
+    c, log_q = coefficients.propose(some, rng)
+    log_ratio = density.log_weight(points.z[some], c, rng) - log_q - points.log_p[some]
     weight, k_hat, log_mean = smoothed(log_ratio)
     chosen = systematic(weight, n, rng)
 
@@ -411,29 +416,8 @@ def _ep_draws(
         "k_hat": max(points.k_hat, k_hat),
         "kish": 1.0 / float((np.bincount(some, weight) ** 2).sum()),
         "log_evidence": points.log_evidence + log_mean,
-        "proposal": points.proposal.text,
     }
-    return drawn.at(chosen), points.log_p[some[chosen]], summary
-
-
-def _points(
-    density: Density,
-    size: int,
-    rng: np.random.Generator,
-    first: Student | None,
-    visit: LogDensity | None = None,
-) -> Points:
-    """Sample the scores, beginning with the proposal `first` or with a search for the mode."""
-    if first is None:
-        start = density.start()
-    else:
-        start = first.center
-        density.run_ep(density.theta(start[None]))
-
-    return sample(
-        density.log_density, start[None], rng,
-        size=size, defensive=density.defensive, first=first, visit=visit,
-    )  # fmt: skip
+    return some[chosen], c[chosen], summary
 
 
 def _first_proposal(start: xr.DataTree | None, model: TrustModel) -> Student | None:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from trustbo.inference import ep
-from trustbo.inference.density import SWEEPS, Density, JointDraws, chunks
+from trustbo.inference.density import Density, JointDraws, chunks
 from trustbo.inference.engine import expected, whiten
 from trustbo.inference.factor import cholesky
 from trustbo.models.effects.effect import Theta
@@ -120,7 +120,7 @@ def _ep_trust(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw trust given non-Gaussian rates by weighted particles; see `_exact_trust`."""
     joint = ep.Joint(density.blocks, predictor, density.prior(theta), density.rates)
-    sites = ep.swept(joint, density.sites, SWEEPS)
+    sites = ep.nearby_sites(joint, density.predicted)
 
     # Draw particles of the predictor f; for each block, Gumbel noise chooses one by weight.
     drawn = [ep.draw_predictors(joint, mean, sites, rng) for _ in range(_PARTICLES)]
