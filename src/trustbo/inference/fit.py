@@ -35,8 +35,6 @@ from trustbo.inference.importance import (
     Points,
     Student,
     sample,
-    smoothed,
-    systematic,
 )
 from trustbo.inference.nuts import sample_by_nuts
 from trustbo.inference.place_maps import place_group
@@ -66,8 +64,8 @@ from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
 """Names of the samplers of `fit`."""
-_CORRECTED = 2
-"""Number of draws for which the EP density is corrected, per point of a round."""
+_NEGLIGIBLE = 0.01
+"""Weight of a point, relative to the mean weight, below which EP is not corrected there."""
 _SIZE = 256
 """Points per round of the importance sampler."""
 _LAST_SIZE = 1024
@@ -384,40 +382,32 @@ def _draws(
         size=size, defensive=density.defensive, first=first, visit=visit,
     )  # fmt: skip
     coefficients = Coefficients.joined(visited)
-    summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
-    summary["proposal"] = points.proposal.text
+    proposal = points.proposal.text
 
     if density.exact:
         chosen = points.resample(n, rng)
         c = coefficients.draw(chosen, rng)
     else:
-        chosen, c, corrected = _corrected(density, points, coefficients, n, size, rng)
-        summary |= corrected
-    return JointDraws(density.theta(points.z[chosen]), c), points.log_p[chosen], summary
+        points, c = _corrected(density, points, coefficients, rng)
+        chosen = points.resample(n, rng)
+        c = c[chosen]
+
+    summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
+    drawn = JointDraws(density.theta(points.z[chosen]), c)
+    return drawn, points.log_p[chosen], summary | {"proposal": proposal}
 
 
 def _corrected(
-    density: Density,
-    points: Points,
-    coefficients: Coefficients,
-    n: int,
-    size: int,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray, dict[str, Any]]:
-    """Correct draws for the errors of EP; return points, coefficients and a summary."""
-    # The more draws are corrected, the more reliable is k-hat.
-    some = points.resample(_CORRECTED * size, rng)
-    c, log_q = coefficients.propose(some, rng)
-    log_ratio = density.log_weight(points.z[some], c, rng) - log_q - points.log_p[some]
-    weight, k_hat, log_mean = smoothed(log_ratio)
-    chosen = systematic(weight, n, rng)
+    density: Density, points: Points, coefficients: Coefficients, rng: np.random.Generator
+) -> tuple[Points, np.ndarray]:
+    """Draw coefficients (point, column) at all points, and correct the weights for errors of EP."""
+    c, log_q = coefficients.propose(np.arange(len(points.z)), rng)
 
-    summary = {
-        "k_hat": max(points.k_hat, k_hat),
-        "kish": 1.0 / float((np.bincount(some, weight) ** 2).sum()),
-        "log_evidence": points.log_evidence + log_mean,
-    }
-    return some[chosen], c[chosen], summary
+    some = np.flatnonzero(points.weight * len(points.z) > _NEGLIGIBLE)
+    log_ratio = points.log_ratio.copy()
+    log_ratio[some] += density.log_joint(points.z[some], c[some], rng)
+    log_ratio[some] -= log_q[some] + points.log_p[some]
+    return Points.from_log_weights(points.z, points.log_p, log_ratio, points.near), c
 
 
 def _first_proposal(start: xr.DataTree | None, model: TrustModel) -> Student | None:

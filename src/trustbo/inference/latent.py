@@ -120,7 +120,7 @@ def _ep_trust(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw trust given non-Gaussian rates by weighted particles; see `_exact_trust`."""
     joint = ep.Joint(density.blocks, predictor, density.prior(theta), density.rates)
-    sites = ep.nearby_sites(joint, density.predicted)
+    sites, _ = density.near.at(density.rates, predictor.noise_sd)
 
     # Draw particles of the predictor f; for each block, Gumbel noise chooses one by weight.
     drawn = [ep.draw_predictors(joint, mean, sites, rng) for _ in range(_PARTICLES)]

@@ -12,11 +12,10 @@ from numpy.random import Generator
 from scipy import special
 
 from trustbo.models.backend import own_flags, special_functions
-from trustbo.models.families.family import Array, Drawn, Family, Moments
-from trustbo.models.families.moments import draw_between_knots, log_normal, match_by_nodes
+from trustbo.models.families.family import Array, Drawn, Family, Moments, Near
+from trustbo.models.families.moments import draw_by_strata, match_by_nodes
 from trustbo.statespace.matrices import namespace
 
-_KNOTS = np.linspace(-5.0, 5.0, 21)  # knots of the proposal, in sds from the mean
 _LEAST = 1e-12  # smallest parameter of a beta distribution that draws are taken from
 _LEAST_VARIANCE = 1e-6  # limits the concentration
 
@@ -55,12 +54,15 @@ class BetaBinomial(Family):
 
     def log_prob(self, y: Array, N: Array, trust: Array, sd: Array) -> Array:
         """See `Family.log_prob`."""
-        xp = namespace(trust)
-        library = special_functions(trust)
         phi = _concentration(sd)
-        choose = -library.betaln(xp.round(y * N) + 1.0, N - xp.round(y * N) + 1.0) - xp.log(N + 1.0)
-        scale = library.gammaln(phi) - library.gammaln(phi + N)
-        return choose + scale + self._of_trust(y, N, trust, phi)
+        return self._constant(y, N, trust, phi) + self._of_trust(y, N, trust, phi)
+
+    def _constant(self, y: Array, N: Array, trust: Array, phi: Array) -> Array:
+        """Compute the terms of the log probability that do not depend on trust."""
+        log_gamma = special_functions(trust).gammaln
+        n = namespace(trust).round(y * N)
+        choose = log_gamma(N + 1.0) - log_gamma(n + 1.0) - log_gamma(N - n + 1.0)
+        return choose + log_gamma(phi) - log_gamma(phi + N)
 
     def _of_trust(self, y: Array, N: Array, trust: Array, phi: Array) -> Array:
         """Compute the terms of the log probability that depend on trust."""
@@ -78,24 +80,26 @@ class BetaBinomial(Family):
         lam = 1.0 / (1.0 / (n + 0.5) + 1.0 / (N - n + 0.5) + 0.2)
         start = (m / v + lam * np.log((n + 0.5) / (N - n + 0.5))) / (1.0 / v + lam)
 
-        constant = self.log_prob(y, N, start, sd) - self._of_trust(y, N, start, _concentration(sd))
+        constant = self._constant(y, N, start, _concentration(sd))
         y = y[..., None]
         N = N[..., None]
         phi = _concentration(sd)[..., None]
         log_mass, mean, var = match_by_nodes(lambda f: self._of_trust(y, N, f, phi), start, m, v)
         return log_mass + constant, mean, var
 
-    def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
-        """See `Family._draw`; draws from a piecewise log-linear approximation of the density."""
-        _, mean, var = self._match(y, N, m, v, sd)
-        knots = mean[..., None] + np.sqrt(var)[..., None] * _KNOTS
-        y, N, m, v, sd = (a[..., None] for a in (y, N, m, v, sd))
+    def _draw(
+        self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator, near: Near
+    ) -> Drawn:
+        """See `Family._draw`; chooses from stratified draws of a normal distribution."""
+        phi = _concentration(sd)
+        center, var = self._match(y, N, m, v, sd)[1:] if near is None else near
+        constant = self._constant(y, N, m, phi)
+        y, N, phi = (a[..., None] for a in (y, N, phi))
 
-        def log_density(f: Array) -> Array:
-            return self.log_prob(y, N, f, sd) + log_normal(f - m, v)
-
-        f, log_q = draw_between_knots(knots, log_density(knots), rng)
-        return f, log_density(f[..., None])[..., 0] - log_q
+        f, log_weight = draw_by_strata(
+            lambda f: self._of_trust(y, N, f, phi), m, v, center, var, rng
+        )
+        return f, log_weight + constant
 
     def mean_rate(self, trust: Array, sd: Array) -> Array:
         """See `Family.mean_rate`."""

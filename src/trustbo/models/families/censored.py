@@ -8,7 +8,7 @@ from numpy.random import Generator
 from scipy.stats import norm
 
 from trustbo.models.backend import special_functions
-from trustbo.models.families.family import Array, Drawn, Moments
+from trustbo.models.families.family import Array, Drawn, Moments, Near
 from trustbo.models.families.gaussian import Gaussian
 from trustbo.models.families.moments import draw_between, match_interval
 from trustbo.statespace.matrices import namespace
@@ -39,12 +39,14 @@ class Censored(Gaussian):
         cut, low, high = _limits(y)
         return np.where(cut, match_interval(low, high, m, v, sd), super()._match(y, N, m, v, sd))
 
-    def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
+    def _draw(
+        self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator, near: Near
+    ) -> Drawn:
         """Draw the rate before clipping, then the predictor given this rate, both exactly."""
         cut, low, high = _limits(y)
         total = np.sqrt(v + sd**2)
         e = draw_between((low - m) / total, (high - m) / total, rng)
-        f, _ = super()._draw(np.where(cut, m + total * e, y), N, m, v, sd, rng)
+        f, _ = super()._draw(np.where(cut, m + total * e, y), N, m, v, sd, rng, near)
         return f, self._match(y, N, m, v, sd)[0]
 
     @np.errstate(under="ignore")  # small weights and tails round to 0

@@ -18,6 +18,8 @@ Moments = Any
 """Arrays of the log mass, the mean and the variance."""
 Drawn = tuple[Array, Array]
 """Draws of the linear predictor, and their log weights."""
+Near = tuple[Array, Array] | None
+"""Mean and variance of a normal distribution near that of the draws, if known."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,9 @@ class Family(ABC):
         """Compute log mass, mean and variance of N(f; m, v) times the likelihood of a rate."""
 
     @abstractmethod
-    def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
+    def _draw(
+        self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator, near: Near
+    ) -> Drawn:
         """Draw f from N(f; m, v) times the likelihood of a rate; return f and a log weight.
 
         The mean weight is the mass of the product. If draws are exact, the weights are constant.
@@ -80,10 +84,19 @@ class Family(ABC):
         one, mean, var = self._match(*arrays)
         return np.where(seen, one, 0.0), np.where(seen, mean, m), np.where(seen, var, v)
 
-    def draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
+    def draw(
+        self,
+        y: Array,
+        N: Array,
+        m: Array,
+        v: Array,
+        sd: Array,
+        rng: Generator,
+        near: Near = None,
+    ) -> Drawn:
         """Draw predictors given rates as in `_draw`; the draws are arbitrary where y is NaN."""
         _, (y, N, m, v, sd) = _measured(y, N, m, v, sd)
-        return self._draw(y, N, m, v, sd, rng)
+        return self._draw(y, N, m, v, sd, rng, near)
 
     def log_resolution(self, y: Array, N: Array) -> Array:
         """Compute the log ratio of a tick count's probability to the density of its rate.

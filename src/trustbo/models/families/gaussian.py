@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.random import Generator
 
-from trustbo.models.families.family import Array, Drawn, Family, Moments
+from trustbo.models.families.family import Array, Drawn, Family, Moments, Near
 from trustbo.models.families.moments import log_normal
 from trustbo.statespace.kalman import gaussian_match
 
@@ -29,7 +29,9 @@ class Gaussian(Family):
     def _match(self, y: Array, N: Array, m: Array, v: Array, sd: Array) -> Moments:
         return gaussian_match(y, m, v, sd)
 
-    def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
+    def _draw(
+        self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator, near: Near
+    ) -> Drawn:
         log_p, mean, var = self._match(y, N, m, v, sd)
         return mean + np.sqrt(var) * rng.standard_normal(mean.shape), log_p
 

@@ -8,7 +8,7 @@ from numpy.random import Generator
 from scipy import special
 
 from trustbo.models.backend import special_functions
-from trustbo.models.families.family import Array, Drawn, Family, Moments
+from trustbo.models.families.family import Array, Drawn, Family, Moments, Near
 from trustbo.models.families.moments import draw_between, match_interval
 from trustbo.statespace.matrices import namespace
 
@@ -74,7 +74,9 @@ class Levels(Family):
         spread = (w * (var + (mean - center) ** 2)).sum(0)
         return total, center, spread
 
-    def _draw(self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator) -> Drawn:
+    def _draw(
+        self, y: Array, N: Array, m: Array, v: Array, sd: Array, rng: Generator, near: Near
+    ) -> Drawn:
         """Draw the mixture component, the report before rounding and f; all draws are exact."""
         log_p = self._components(y, m, v, sd)[0]
         noise = _SDS[np.argmax(log_p + rng.gumbel(size=log_p.shape), axis=0)] * sd

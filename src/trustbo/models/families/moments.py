@@ -15,9 +15,9 @@ _LOG_WEIGHTS = np.log(_WEIGHTS / _WEIGHTS.sum())
 _STEP = 0.05  # step of finite differences in the search for the mode
 _N_NEWTON_STEPS = 3
 _LONGEST_STEP = 2.0  # limit on a Newton step, in units of the linear predictor
-_WIDER = 1.1  # ratio of the sd of the nodes to the sd that the curvature at the mode gives
+_WIDER = 1.1  # ratio of the sd of the nodes or strata to that of the product
+_N_STRATA = 12  # number of draws from which one is chosen
 _LEAST_VARIANCE = 1e-9
-_LEAST_RISE = 1e-9  # rises below this are replaced, because the formulas divide by the rise
 _LARGEST_LOG = -1e-300  # largest log ratio of probabilities, so that 1 minus the ratio is not 0
 
 
@@ -68,22 +68,33 @@ def draw_between(a: ndarray, b: ndarray, rng: Generator) -> ndarray:
     return np.where(mirror, -z, z)
 
 
-def draw_between_knots(knots: ndarray, log_f: ndarray, rng: Generator) -> Drawn:
-    """Draw from a density whose log is linear between knots (..., knot); also return the log."""
-    width = np.diff(knots)
-    rise = np.diff(log_f)
-    rise = np.where(np.abs(rise) < _LEAST_RISE, _LEAST_RISE, rise)
-    log_mass = log_f[..., :-1] + np.log(width) + np.log(np.expm1(rise) / rise)
+def draw_by_strata(
+    log_prob: Callable[[ndarray], ndarray],
+    m: ndarray,
+    v: ndarray,
+    center: ndarray,
+    var: ndarray,
+    rng: Generator,
+) -> Drawn:
+    """Draw from N(m, v) times a likelihood; the mean weight is the mass of the product.
 
-    # Choose a piece by the Gumbel-max trick, then draw within the piece.
-    piece = np.argmax(log_mass + rng.gumbel(size=log_mass.shape), axis=-1)[..., None]
-    start, width, slope, low = (
-        np.take_along_axis(a, piece, axis=-1)[..., 0] for a in (knots, width, rise, log_f)
-    )
-    share = np.log1p(rng.random(start.shape) * np.expm1(slope)) / slope
+    Of stratified draws of a distribution a little wider than N(center, var), one is chosen by
+    weight. `log_prob` returns log likelihoods of draws (..., stratum).
+    """
+    n = _N_STRATA
+    x = special.ndtri((np.arange(n) + rng.random((*m.shape, 1))) / n)
+    f = center[..., None] + _WIDER * np.sqrt(var)[..., None] * x
 
-    log_total = special.logsumexp(log_mass, axis=-1)
-    return start + share * width, low + share * slope - log_total
+    # The normal densities relative to each other: constants are added at the end.
+    log_w = log_prob(f) - 0.5 * (f - m[..., None]) ** 2 / v[..., None] + 0.5 * x**2
+    largest = log_w.max(-1, keepdims=True)
+    total = np.cumsum(np.exp(log_w - largest), axis=-1)
+
+    level = total[..., -1:] * rng.random((*m.shape, 1))
+    chosen = np.minimum((total < level).sum(-1, keepdims=True), n - 1)
+    drawn = np.take_along_axis(f, chosen, axis=-1)[..., 0]
+    log_mean = largest[..., 0] + np.log(total[..., -1] / n)
+    return drawn, log_mean + np.log(_WIDER) + 0.5 * np.log(var / v)
 
 
 def match_by_nodes(
