@@ -36,7 +36,9 @@ _LEAST_NOISE = 1e-6
 _SWEEPS = 1
 """Number of EP sweeps at each point for an evidence, beginning with the sites at the mode."""
 _SETTLED = 12
-"""Number of EP sweeps that find the sites at the mode."""
+"""Largest number of EP sweeps that find the sites at the mode."""
+_STEADY = 1e-3
+"""Relative change of the sites in a sweep below which the sweeps end."""
 _DAMPING = 0.7
 """Damping of the EP sweeps that find the sites at the mode."""
 _DEVIATIONS = 4
@@ -244,7 +246,11 @@ class Density:
         if not self.exact:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
             joint = self._joint(center)
-            self.sites = ep.swept(joint, self.sites, _SETTLED, _DAMPING)
+            for _ in range(_SETTLED):
+                before = self.sites
+                self.sites = ep.swept(joint, before, 1, _DAMPING)
+                if self.sites.close_to(before, _STEADY):
+                    break
             self.near = ep.Nearby.from_sites(joint, self.sites)
 
     def start(self) -> np.ndarray:

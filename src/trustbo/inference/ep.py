@@ -72,6 +72,12 @@ class Sites(NamedTuple):
         some = self.lam != 0.0
         return np.where(some, self.eta / np.where(some, self.lam, 1.0), 0.0)
 
+    def close_to(self, other: "Sites", share: float) -> bool:
+        """Return whether no site differs from another by more than a share of the largest one."""
+        return all(
+            np.abs(a - b).max() <= share * np.abs(b).max() for a, b in zip(self, other, strict=True)
+        )
+
     def at(self, rates: Rates, sd: np.ndarray) -> "Sites":
         """Return the sites, with exact values for linear observations given the noise sd."""
         lam = np.where(rates.linear, sd**-2.0, self.lam)
