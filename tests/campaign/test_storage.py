@@ -6,14 +6,12 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import ENDS, OPTIONS, begin, drive, same
+from folders import ENDS, OPTIONS, begin, drive, numbers, same
 from worlds import ModelSimulator, random_cells
 
 import trustbo as tb
@@ -31,49 +29,42 @@ class Dead(BaseException):
     """The process ends here."""
 
 
-@pytest.mark.parametrize("moment", ["before", "after"])
 @pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_campaign_that_dies_at_any_write_resumes_identically(
-    workspace, tmp_path, monkeypatch, moment, every
+    workspace, tmp_path, monkeypatch, every
 ):
-    """At every write of the campaign; or at the last of each kind, which is faster."""
-    rename, targets = os.replace, []
+    """Before and after every write of the campaign; or the last of each kind, which is faster.
 
-    def dies_at(n):
-        targets.clear()
+    The folder is copied at these moments, as a process that dies would leave it.
+    """
+    rename, kinds, left = os.replace, [], {}
 
-        def replace(source, target):
-            if isinstance(target, str):  # numba's, which keeps what it compiles
-                return rename(source, target)
-            targets.append(re.sub(r"\d+", "N", target.name))
-            if len(targets) == n and moment == "before":
-                raise Dead
+    def replace(source, target):
+        if isinstance(target, str):  # numba's, which keeps what it compiles
             rename(source, target)
-            if len(targets) == n:
-                raise Dead
-            return None
+            return
+        kinds.append(re.sub(r"\d+", "N", target.name))
+        n = len(kinds)
+        left[n] = [tmp_path / f"{moment} {n}" for moment in ("before", "after")]
+        shutil.copytree(tmp_path / "whole", left[n][0])
+        rename(source, target)
+        shutil.copytree(tmp_path / "whole", left[n][1])
 
-        return replace
-
-    monkeypatch.setattr(os, "replace", dies_at(0))
-    with tb.Campaign(workspace, *ENDS, directory=tmp_path / "whole", **OPTIONS) as campaign:
-        whole = drive(campaign)
-    writes = dict(enumerate(targets, start=1))
-    assert len(writes) > 18
-    last = {target: n for n, target in writes.items()}
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", replace)
+        with tb.Campaign(workspace, *ENDS, directory=tmp_path / "whole", **OPTIONS) as campaign:
+            whole = numbers(drive(campaign))
+    assert len(kinds) > 18
+    last = {kind: n for n, kind in enumerate(kinds, start=1)}
     assert set(last) == {"workspace.nc", "N.nc", "N-N.nc", "campaign.json"}
-    for n in writes if every else sorted({1, 2, *last.values()}):
-        folder = tmp_path / str(n)
-        monkeypatch.setattr(os, "replace", dies_at(n))
-        with pytest.raises(Dead):
-            drive(tb.Campaign(workspace, *ENDS, directory=folder, **OPTIONS))
-        monkeypatch.setattr(os, "replace", rename)
-        if not (folder / "campaign.json").exists():  # nothing had begun
-            assert n <= 2
-            continue
-        with tb.Campaign.load(folder) as campaign:
-            same(drive(campaign), whole)
-        same(tb.load_result(folder), whole)
+    assert not (left[2][0] / "campaign.json").exists()  # nothing had begun
+    assert (left[2][1] / "campaign.json").exists()
+    for n in left if every else sorted({2, *last.values()}):
+        for folder in left[n]:
+            if (folder / "campaign.json").exists():
+                with tb.Campaign.load(folder) as campaign:
+                    drive(campaign)
+                same(tb.load_result(folder), whole)
 
 
 def test_loading_says_that_it_learns_from_a_mission(workspace, tmp_path, capsys):
@@ -173,18 +164,13 @@ def test_folder_that_holds_a_campaign_is_refused_or_replaced(workspace, folder, 
         tb.load_result(copy)
 
 
-def test_folder_is_locked_for_one_campaign_at_a_time(workspace, tmp_path):
-    other = "import sys, trustbo as tb; tb.Campaign.load(sys.argv[1])"
-
-    def elsewhere():
-        command = [sys.executable, "-c", other, tmp_path / "a"]
-        return subprocess.run(command, capture_output=True, text=True, check=False)
-
+def test_folder_is_locked_for_one_campaign_at_a_time(workspace, elsewhere, tmp_path):
+    load_it = f"import trustbo as tb; tb.Campaign.load({str(tmp_path / 'a')!r}).close()"
     with tb.Campaign(workspace, *ENDS, directory=tmp_path / "a") as campaign:
-        assert "another campaign" in elsewhere().stderr
+        assert "another campaign" in elsewhere(load_it)
         with pytest.raises(tb.TrustboError, match="another campaign"):
             campaign.save(tmp_path / "a", overwrite=True)
-    assert elsewhere().returncode == 0
+    assert elsewhere(load_it) == ""
     for load in (tb.Campaign.load, tb.load_result, tb.resume):
         with pytest.raises(tb.TrustboError, match="nothing"):
             load(tmp_path / "nothing")
@@ -363,19 +349,14 @@ def test_record_that_another_program_changed_is_noticed(workspace, folder, tmp_p
         assert len(campaign.state.failures) == 3
 
 
-def test_deleted_lock_does_not_let_two_processes_in(workspace, tmp_path):
-    script = (
-        "import sys, trustbo as tb; c = tb.Campaign.load(sys.argv[1]); print(flush=True);"
-        "sys.stdin.read()"
-    )
+def test_deleted_lock_does_not_let_two_processes_in(workspace, elsewhere, tmp_path):
     with begin(workspace, tmp_path) as campaign:
         (tmp_path / ".lock").unlink()
-        command = [sys.executable, "-c", script, tmp_path]
-        other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        other.stdout.readline()
+        load_it = f"import trustbo as tb; other = tb.Campaign.load({str(tmp_path)!r})"
+        assert elsewhere(load_it) == ""
         with pytest.raises(tb.TrustboError, match="another campaign"):
             campaign.fail("rain")
-        other.communicate()
+        assert elsewhere("other.close()") == ""
         campaign.fail("rain")
 
 
@@ -396,10 +377,10 @@ def test_file_system_without_locks_is_used_with_a_warning(workspace, tmp_path, m
 
 
 FORK = """
-import os, sys
+import os
 import trustbo as tb
 
-campaign = tb.Campaign.load(sys.argv[1])
+campaign = tb.Campaign.load({!r})
 child = os.fork()
 try:
     campaign.fail("rain")
@@ -408,12 +389,13 @@ except tb.TrustboError as error:
     os._exit(7)
 assert child and os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 campaign.fail("rain")
+campaign.close()
 """
 
 
-def test_copy_of_the_process_cannot_record(workspace, tmp_path):
+def test_copy_of_the_process_cannot_record(workspace, elsewhere, tmp_path):
     begin(workspace, tmp_path).close()
-    subprocess.run([sys.executable, "-W", "ignore", "-c", FORK, tmp_path], check=True)
+    assert elsewhere(FORK.format(str(tmp_path))) == ""
     with tb.Campaign.load(tmp_path) as campaign:
         assert len(campaign.state.failures) == 2
 
