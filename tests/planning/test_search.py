@@ -1,5 +1,6 @@
 """Plans against all admissible paths written out, against networkx, and by closed forms."""
 
+import functools
 import pickle
 
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ PARAMS = TrustParams(0.6, np.array([0.8, 0.4]), -0.3, 0.1, 0.1)
 ENDS = (3, 0), (0, 3)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def workspace():
     passable = np.ones((4, 4), bool)
     passable[1, 1] = False
@@ -80,17 +81,9 @@ def test_networkx_finds_plans_of_the_same_value(seed):
     assert refused > 0
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {}, {"objective": "terminal"}, {"objective": "mean", "max_bounds": 5},
-        {"family": "censored"}, {"family": "beta_binomial", "max_bounds": "shortest"},
-        {"max_failure": 0.2, "failure_cost": 3.0}, {"objective": "mean", "max_failure": 0.2},
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize("by_robot", [False, True])
-def test_networkx_finds_plans_of_functions(workspace, options, by_robot):
-    """Draws of a NumPyro function, with and without weights of each robot."""
+@functools.cache
+def draws_of_function(workspace, by_robot):
+    """Prior draws of a NumPyro function, which is compiled once."""
 
     def model(awareness, contact_rate=None):
         weight = dist.HalfNormal(0.5).expand([2]).to_event(1)
@@ -102,7 +95,21 @@ def test_networkx_finds_plans_of_functions(workspace, options, by_robot):
             rates = ContactRate(drift, beta0, 0.1, 0.1)
             numpyro.sample("contact_rate", rates, obs=contact_rate)
 
-    draws = learner_of(model, workspace).prior_draws(20, 0, workspace)
+    return learner_of(model, workspace).prior_draws(20, 0, workspace)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {}, {"objective": "terminal"}, {"objective": "mean", "max_bounds": 5},
+        {"family": "censored"}, {"family": "beta_binomial", "max_bounds": "shortest"},
+        {"max_failure": 0.2, "failure_cost": 3.0}, {"objective": "mean", "max_failure": 0.2},
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("by_robot", [False, True])
+def test_networkx_finds_plans_of_functions(workspace, options, by_robot):
+    """With and without weights of each robot."""
+    draws = draws_of_function(workspace, by_robot)
     planner = Planner(workspace, *ENDS, **options)
     if "max_failure" in options:
         planner = planner.with_risk(np.random.default_rng(0).uniform(0.0, 0.1, (8, 4, 4)))
