@@ -31,9 +31,10 @@ demo: $(VENV)/.installed
 	$(BIN)/python scripts/demo.py --out out/demo
 
 # A fresh clone compiles for long what most tests run for short. Without optimisation, tests of NUTS
-# take longer, but all tests together take a little less.
+# take longer, but all tests together take a little less. nbmake, which runs notebooks, takes a second
+# to import in each process.
 test: $(VENV)/.installed-dev
-	XLA_FLAGS=--xla_backend_optimization_level=0 $(PYTEST) -m "not slow" tests
+	XLA_FLAGS=--xla_backend_optimization_level=0 $(PYTEST) -p no:nbmake -m "not slow" tests
 
 # Copies, as JupyterLab saves what it runs, and notebooks write files beside themselves.
 jupyter: $(VENV)/.installed-notebook

@@ -3,8 +3,8 @@
 import copy
 import dataclasses
 import pickle
-import subprocess
 import sys
+import threading
 
 import numpy as np
 import numpyro.distributions as dist
@@ -71,29 +71,26 @@ def test_priors_of_other_features_are_refused():
         dataclasses.replace(Priors.from_features(FEATURES), features=("a", "b", "c"))
 
 
-THREADS = """
-import sys, threading
-from trustbo.models import PooledTrust
+def test_threads_share_the_default_priors(monkeypatch):
+    monkeypatch.setattr("trustbo.models.priors._DEFAULTS", {})
+    barrier, models = threading.Barrier(8), []
 
-sys.setswitchinterval(1e-5)
-barrier = threading.Barrier(8)
-models = []
+    def make():
+        barrier.wait()
+        models.append(PooledTrust())
 
-def make():
-    barrier.wait()
-    models.append(PooledTrust())
-
-threads = [threading.Thread(target=make) for _ in range(8)]
-for thread in threads:
-    thread.start()
-for thread in threads:
-    thread.join()
-assert len({id(model.priors) for model in models}) == 1
-"""
-
-
-def test_threads_share_the_default_priors():
-    subprocess.run([sys.executable, "-c", THREADS], check=True)
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        threads = [threading.Thread(target=make) for _ in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(before)
+    assert len(models) == 8
+    assert len({id(model.priors) for model in models}) == 1
 
 
 def test_records_tell_truncated_priors_apart():
