@@ -1,6 +1,9 @@
 """Settings of every test, and fixtures that several rooms share."""
 
+import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -34,6 +37,38 @@ def _scratch_folder(tmp_path_factory):
     os.chdir(tmp_path_factory.mktemp("scratch"))
     yield
     os.chdir(before)
+
+
+LISTENER = """
+import contextlib, io, json, sys, traceback
+names = {}
+for line in sys.stdin:
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        try:
+            exec(json.loads(line), names)
+        except BaseException:
+            traceback.print_exc(file=printed)
+    print(json.dumps(printed.getvalue()), flush=True)
+"""
+
+
+@pytest.fixture(scope="session")
+def elsewhere():
+    """Run code in another process and return what it prints, or its traceback.
+
+    All tests share the process and its global names, as it takes long to import the package.
+    """
+    command = [sys.executable, "-W", "ignore", "-c", LISTENER]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **pipes) as process:
+
+        def run(code):
+            process.stdin.write(json.dumps(code) + "\n")
+            process.stdin.flush()
+            return json.loads(process.stdout.readline())
+
+        yield run
+        process.stdin.close()
 
 
 @pytest.fixture(scope="session")
