@@ -23,27 +23,32 @@ def printed(program):
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def test_importing_loads_nothing_heavy():
+@pytest.fixture(scope="module")
+def loaded():
+    """Modules that a fresh process has loaded after each of three imports."""
     program = (
-        "import sys, trustbo; "
-        "print(sorted({'jax', 'numpyro', 'rasterio', 'matplotlib', 'networkx', 'bokeh', "
-        "'xarray'} "
-        "& set(sys.modules)))"
+        "import sys\n"
+        "for step in ('import trustbo', 'trustbo.Mission', 'import trustbo.inference'):\n"
+        "    exec(step)\n"
+        "    print(*sys.modules)\n"
     )
-    assert printed(program) == "[]"
+    return [set(line.split()) for line in printed(program).splitlines()]
 
 
-def test_data_of_missions_load_no_compiler():
-    program = "import sys, trustbo; trustbo.Mission; print('numba' in sys.modules)"
-    assert printed(program) == "False"
+def test_importing_loads_nothing_heavy(loaded):
+    heavy = {"jax", "numpyro", "rasterio", "matplotlib", "networkx", "bokeh", "xarray"}
+    assert "trustbo" in loaded[0]
+    assert not heavy & loaded[0]
 
 
-def test_fitting_loads_no_figures():
-    program = (
-        "import sys, trustbo.inference; "
-        "print(sorted({'arviz', 'arviz_plots', 'matplotlib'} & set(sys.modules)))"
-    )
-    assert printed(program) == "[]"
+def test_data_of_missions_load_no_compiler(loaded):
+    assert "trustbo.data" in loaded[1]
+    assert "numba" not in loaded[1]
+
+
+def test_fitting_loads_no_figures(loaded):
+    assert "trustbo.inference" in loaded[2]
+    assert not {"arviz", "arviz_plots", "matplotlib"} & loaded[2]
 
 
 def test_type_checkers_are_told_that_it_is_typed():
