@@ -51,8 +51,13 @@ def test_run_writes_a_campaign_with_its_report_and_maps(campaign):
     assert len(tb.load_result(campaign).missions) == 2
 
 
-def test_a_resumed_campaign_equals_one_that_was_not_interrupted(campaign, flags, tmp_path):
-    assert call(*flags, "--missions", 1, "--seed", 1, "--out", tmp_path / "two") == 0
+def test_a_resumed_campaign_equals_one_that_was_not_interrupted(campaign, flags, rasters, tmp_path):
+    """Also if its start is given by a position in the cell."""
+    with rasterio.open(rasters / "dem.tif") as raster:
+        left, bottom, _, _ = raster.bounds
+    words = [f"x={left + 15.0},y={bottom + 15.0}" if word == "2,0" else word for word in flags]
+    assert words != list(flags)
+    assert call(*words, "--missions", 1, "--seed", 1, "--quiet", "--out", tmp_path / "two") == 0
     assert call("resume", tmp_path / "two", "--missions", 2, "--quiet") == 0
     one, two = tb.load_result(campaign), tb.load_result(tmp_path / "two")
     assert one.path == two.path
@@ -64,14 +69,6 @@ def test_an_existing_campaign_is_replaced_only_if_asked_to(campaign, flags, caps
     assert call(*flags, "--missions", 1, "--out", campaign) == 2
     assert capsys.readouterr().err.count("error: ") == 1
     assert sorted(campaign.iterdir()) == before
-
-
-def test_a_position_is_the_cell_that_holds_it(flags, rasters, tmp_path):
-    with rasterio.open(rasters / "dem.tif") as raster:
-        left, bottom, _, _ = raster.bounds
-    words = [f"x={left + 15.0},y={bottom + 15.0}" if word == "2,0" else word for word in flags]
-    assert call(*words, "--missions", 1, "--quiet", "--out", tmp_path / "out") == 0
-    assert tb.load_result(tmp_path / "out").path[0] == (2, 0)
 
 
 def test_export_writes_the_formats_asked_for(campaign, tmp_path, capsys):

@@ -247,7 +247,6 @@ def accepts(history):
     "events",
     [
         [],
-        ["arrived", "excluded"],
         ["no rates", "arrived", "unknown cell", "excluded", "failed", "arrived", "arrived"],
         ["failed there", "ended early", "one robot without rates", "rain"],
         ["ended before the unknown cell", "excluded", "ended early", "excluded"],

@@ -57,7 +57,7 @@ def run(workspace, simulator, n, directory=None):
 @pytest.fixture(scope="module")
 def folder(workspace, simulator, tmp_path_factory):
     directory = tmp_path_factory.mktemp("campaign") / "run"
-    run(workspace, simulator, 3, directory)
+    run(workspace, simulator, 2, directory)
     return directory
 
 
@@ -68,7 +68,7 @@ def result(folder):
 
 def test_a_campaign_learns_the_variables_of_the_function(result):
     draws = result.posterior["posterior"]
-    assert result.table()["state"].tolist() == ["learned"] * 3
+    assert result.table()["state"].tolist() == ["learned"] * 2
     for name, truth in {"level": 0.1, "most": 0.4}.items():
         assert abs(float(draws[name].mean()) - truth) < 4.0 * float(draws[name].std())
 
@@ -85,7 +85,7 @@ def test_everything_that_reads_a_campaign_accepts_it(result, folder, workspace, 
     assert np.isfinite(float(scores["mean_log_score"]))
 
     with tb.Campaign.load(folder, model=saturating) as campaign:
-        assert 0.0 <= tb.RegretBound().probability(campaign, 3) <= 1.0
+        assert 0.0 <= tb.RegretBound().probability(campaign, 2) <= 1.0
         follower = tb.Follower(campaign)
         assert np.isfinite(follower.ahead().rate).all()
     result.save(tmp_path / "copy")
@@ -99,9 +99,9 @@ def test_everything_that_reads_a_campaign_accepts_it(result, folder, workspace, 
 
 def test_a_resumed_campaign_is_bit_identical(folder, workspace, simulator, tmp_path):
     stopped = tmp_path / "stopped"
-    run(workspace, simulator, 2, stopped)
+    run(workspace, simulator, 1, stopped)
     resumed = tb.resume(
-        stopped, simulator=simulator, model=saturating, n_iterations=3, progress=False
+        stopped, simulator=simulator, model=saturating, n_iterations=2, progress=False
     )
     whole = tb.load_result(folder, model=saturating)
     for a, b in zip(resumed.posteriors, whole.posteriors, strict=True):
