@@ -25,7 +25,7 @@ def of_robots(awareness, contact_rate=None):
         weight = numpyro.sample("weight", dist.Normal(0.2, 0.3))
     drift = (awareness * weight.T).sum(-1)
     with numpyro.plate("mission", len(awareness)):
-        rates = ContactRate(drift, 0.4, 0.05, 0.05)
+        rates = ContactRate(drift, 0.4, 0.3, 0.3)
         numpyro.sample("contact_rate", rates, obs=contact_rate)
 
 

@@ -39,10 +39,9 @@ def coupled(awareness, contact_rate=None):
     beta = numpyro.sample("beta", dist.Normal(0.0, 0.5).expand((2,)).to_event(1))
     own = numpyro.sample("own", dist.Beta(2.0, 2.0))
     other = numpyro.sample("other", dist.Normal(0.0, 0.1))
-    delta = numpyro.sample("delta", dist.HalfNormal(0.2).expand((2,)).to_event(1))
     B0 = own * np.eye(n) + other * (1.0 - np.eye(n))
     with numpyro.plate("mission", len(awareness)):
-        rates = ContactRate(awareness @ beta, B0, delta[0], delta[1])
+        rates = ContactRate(awareness @ beta, B0, 0.3, 0.2)
         numpyro.sample("contact_rate", rates, obs=contact_rate)
 
 
@@ -51,10 +50,10 @@ def robots_apart(awareness, contact_rate=None):
     n = awareness.shape[2]
     beta = numpyro.sample("beta", dist.Normal(0.0, 0.5).expand((2,)).to_event(1))
     beta0 = numpyro.sample("beta0", dist.Beta(2.0, 2.0))
-    delta_v = numpyro.sample("delta_v", dist.HalfNormal(0.2).expand((n,)).to_event(1))
+    delta_v = numpyro.deterministic("delta_v", np.linspace(0.1, 0.3, n))
     with numpyro.plate("mission", len(awareness)):
         rates = ContactRate(
-            awareness[..., 0] * beta[0], beta0, 0.1, delta_v, offset=awareness[..., 1] * beta[1]
+            awareness[..., 0] * beta[0], beta0, 0.3, delta_v, offset=awareness[..., 1] * beta[1]
         )
         numpyro.sample("contact_rate", rates, obs=contact_rate)
 
