@@ -121,7 +121,14 @@ def trees(missions):
 
 @pytest.fixture(scope="module")
 def of_nuts(missions):
-    return tb.fit(missions, PooledTrust(), sampler="nuts", draws=250, progress=False, check=False)
+    """A single chain."""
+    size = {"chains": 1, "draws": 20, "warmup": 20}
+    return tb.fit(missions, PooledTrust(), sampler="nuts", progress=False, check=False, **size)
+
+
+def test_nuts_samples_a_single_chain(of_nuts):
+    assert dict(of_nuts["posterior"].sizes)["chain"] == 1
+    assert dict(of_nuts["posterior"].sizes)["draw"] == 20
 
 
 def call(name, tree):

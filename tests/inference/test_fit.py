@@ -271,13 +271,6 @@ def test_mistakes_are_refused_before_sampling(missions):
         fit(unseen)
 
 
-def test_nuts_samples_a_single_chain(missions):
-    size = {"chains": 1, "draws": 10, "warmup": 10, "progress": False, "check": False}
-    found = fit(missions[:2], PooledTrust(), sampler="nuts", latent=False, **size)
-    assert dict(found["posterior"].sizes)["chain"] == 1
-    assert dict(found["posterior"].sizes)["draw"] == 10
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "model",

@@ -183,11 +183,29 @@ def first_mission(n_ticks):
     return tb.Mission.from_arrays(None, np.full((8, 3, 1), 0.9), rates, n_ticks=ticks)
 
 
-def test_rates_that_are_all_1_are_accepted_with_the_same_answer_from_both_samplers():
-    missions = [first_mission(100.0)]
-    options = {"latent": False, "progress": False}
-    a = tb.fit(missions, own, sampler="importance", **options)["posterior"]
-    b = tb.fit(missions, own, sampler="nuts", draws=300, check=False, **options)["posterior"]
+@pytest.fixture(scope="module")
+def of_ones():
+    """The posterior of a mission whose rates are all 1; it passes the checks of `fit`."""
+    return tb.fit([first_mission(100.0)], own, sampler="importance", latent=False, progress=False)[
+        "posterior"
+    ]
+
+
+def test_rates_that_are_all_1_are_accepted(of_ones):
+    """They say that trust is high and noise small, which the prior does not."""
+    weight, delta_v = of_ones["weight"], of_ones["delta_v"]
+    assert float(weight.mean()) > 1.05  # 0.9 weight is near 1
+    assert float(weight.std()) < 0.25
+    assert float(delta_v.mean()) < float(NOISE.mean)
+
+
+@pytest.mark.slow  # its function is compiled for NUTS
+def test_nuts_has_the_same_answer_for_rates_that_are_all_1(of_ones):
+    b = tb.fit(
+        [first_mission(100.0)], own, sampler="nuts", draws=300, check=False, latent=False,
+        progress=False,
+    )["posterior"]  # fmt: skip
+    a = of_ones
     for name in ("weight", "beta0", "delta_w", "delta_v"):
         sd = float(b[name].std())
         assert abs(float(a[name].mean() - b[name].mean())) < 0.25 * sd
