@@ -24,8 +24,8 @@ def drawn(seed=0, *, robot=0.0, place=0.0, slope=0.8, n_missions=8):
     return missions
 
 
-def checked(missions, model=MODEL):
-    return tb.check(tb.fit(missions, model, progress=False))
+def checked(missions, model=MODEL, **options):
+    return tb.check(tb.fit(missions, model, progress=False, **options))
 
 
 def test_nothing_stands_out_where_nothing_is_wrong():
@@ -123,7 +123,8 @@ def test_place_effects_on_logits_are_reported_as_contact():
         )
         for m in drawn(place=-0.35)
     ]
-    found = checked(counted, PooledTrust(family="beta_binomial", effects=(PlaceEffect(),)))
+    model = PooledTrust(family="beta_binomial", effects=(PlaceEffect(),))
+    found = checked(counted, model, draws=250)
 
     assert found.table.loc["places", "label"] == "(0, 5)"
     assert -0.6 < found.table.loc["places", "size"] < -0.1
@@ -131,7 +132,7 @@ def test_place_effects_on_logits_are_reported_as_contact():
 
 @pytest.mark.parametrize("model", [PooledTrust(), CoupledTrust()], ids=["pooled", "coupled"])
 def test_a_weight_of_the_wrong_sign_stands_out(model):
-    found = checked(drawn(slope=-0.8), model)
+    found = checked(drawn(slope=-0.8), model, draws=250)
 
     assert found.table.loc["weights", "stands_out"]
     assert found.table.loc["weights", "label"] == "line_of_sight"

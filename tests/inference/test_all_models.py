@@ -20,6 +20,8 @@ MODELS = {
         (PooledTrust, HierarchicalTrust, CoupledTrust), FAMILIES, EFFECTS
     )
 }
+for model, family in product(("HierarchicalTrust", "CoupledTrust"), FAMILIES):
+    del MODELS[f"{model}, {family}, 0 effects"]  # the pooled ones show what a fit has without
 MODELS |= {
     f"PooledTrust, {family}, shared noise": PooledTrust(family=family, shared_noise=True)
     for family in ("gaussian", "censored")
