@@ -51,7 +51,7 @@ def test_floating_point_errors_of_users_are_not_raised_by_the_library():
         campaign.maps()
         tb.check(campaign.posterior)
         for model in (CoupledTrust(), PooledTrust(family="censored")):
-            posterior = fit(campaign.missions, model, workspace=workspace)
+            posterior = fit(campaign.missions, model, workspace=workspace, draws=100)
         tb.inference.loo(posterior)
         follow = tb.inference.TrustFilter(posterior)
         follow.predict(campaign.missions[0].awareness[:, :, : len(workspace.features)])
