@@ -176,7 +176,7 @@ def sample_by_nuts(
     else:
         values = {name: samples[name] for name in density.scores.priors}
         theta = density.model.theta(values, resolution)
-        drawn = JointDraws(theta, samples["coefficients"], samples["linear_predictor"])
+        drawn = JointDraws(theta, samples["coefficients"])
 
     by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
     found, complaints = complaints_of(by_chain, stats["diverging"])

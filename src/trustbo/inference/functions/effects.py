@@ -101,7 +101,7 @@ class AddedEffects:
         parts = []
         for where, chunk in chunks(theta):
             fit, prior = self._fit(space.take(where), drift[where], chunk)
-            mean, deviation = coefficients_of(prior, fit, 1, rng)
+            mean, deviation, _ = coefficients_of(prior, fit, 1, rng)
             parts.append(mean + deviation[:, 0])
         return self._variables(np.concatenate(parts), theta)
 
