@@ -58,7 +58,10 @@ def complaints_of(
     min_ess: float = MIN_ESS,
     max_divergences: int = 0,
 ) -> tuple[dict[str, float], list[str]]:
-    """Compute the NUTS diagnostics of draws (chain, draw, ...), and list the failed checks."""
+    """Compute the NUTS diagnostics of draws (chain, draw, ...), and list the failed checks.
+
+    A failed check names the worst variable.
+    """
     flat = {  # in a DataTree, "/" separates groups
         name.replace("/", "."): values.reshape(*values.shape[:2], -1)
         for name, values in draws.items()
@@ -70,19 +73,22 @@ def complaints_of(
 
     worst = np.nan
     least = np.nan
+    of_worst = of_least = ""
     if free:  # otherwise, a single chain has not moved at all
         parameters = arviz_base.from_dict({"posterior": free})["posterior"].to_dataset()
         r_hat = sampling_diagnostics.rhat(parameters)
         ess = sampling_diagnostics.ess(parameters, method="bulk")
-        worst = max(float(values.max()) for values in r_hat.data_vars.values())
-        least = min(float(values.min()) for values in ess.data_vars.values())
+        worst, of_worst = max(
+            (float(values.max()), f" of {name}") for name, values in r_hat.items()
+        )
+        least, of_least = min((float(values.min()), f" of {name}") for name, values in ess.items())
     divergences = int(diverging.sum())
 
     complaints = []
     if not worst <= max_rhat:  # also true for NaN
-        complaints.append(f"R-hat is {worst:.3f} (limit {max_rhat})")
+        complaints.append(f"R-hat{of_worst} is {worst:.3f} (limit {max_rhat})")
     if not least >= min_ess:
-        complaints.append(f"bulk ESS is {least:.0f} (minimum {min_ess:.0f})")
+        complaints.append(f"bulk ESS{of_least} is {least:.0f} (minimum {min_ess:.0f})")
     if divergences > max_divergences:
         complaints.append(f"{divergences} transitions diverged (limit {max_divergences})")
     return dict(zip(NUTS_NAMES, (worst, least, divergences), strict=True)), complaints

@@ -333,12 +333,13 @@ class Chart(NamedTuple):
     """Conversion of points from the coordinates of the first chart."""
 
 
-def sample(charts: Sequence[Chart], seed: int) -> Sample:
+def sample(charts: Sequence[Chart], seed: int, names: Sequence[str] | None = None) -> Sample:
     """Sample a posterior; the caller must check `complaints`.
 
     Args:
         charts: Coordinates of the posterior. The points of the result are those of the first.
         seed: Random seed.
+        names: Name of each coordinate of the first chart, for complaints; by default, its number.
     """
     enough = _ENOUGH / len(charts)
     for attempt, wanted in enumerate(_WANTED):
@@ -354,9 +355,9 @@ def sample(charts: Sequence[Chart], seed: int) -> Sample:
 
             runs.append(_Run(charts, parts))
             if not _is_good(runs[-1].log_weight(), enough):
-                return _pooled(runs)
+                return _pooled(runs, names)
 
-        found = _pooled(runs)
+        found = _pooled(runs, names)
         if not found.complaints or wanted == _WANTED[-1]:
             return found
     raise AssertionError("the last attempt returns")
@@ -624,7 +625,7 @@ def _is_good(log_weight: np.ndarray, enough: float) -> bool:
     return k_hat <= MAX_KHAT and (weight**2).sum() * enough <= 1.0
 
 
-def _pooled(runs: Sequence[_Run]) -> Sample:
+def _pooled(runs: Sequence[_Run], names: Sequence[str] | None) -> Sample:
     """Join the points of runs, and list the reasons why they may not represent the posterior."""
     x = np.concatenate([run.x[0] for run in runs])
     log_p = np.concatenate([run.log_p[0] for run in runs])
@@ -641,10 +642,10 @@ def _pooled(runs: Sequence[_Run]) -> Sample:
         complaint = f"k-hat is {k_hat:.2f} (limit {MAX_KHAT}), or too few points are effective"
         return pooled._replace(complaints=[f"{complaint} ({pooled.kish:.0f})"])
     complaints = [] if k_hat <= MAX_KHAT else [f"k-hat is {k_hat:.2f} (limit {MAX_KHAT})"]
-    return pooled._replace(complaints=complaints + _disagreements(runs, pooled))
+    return pooled._replace(complaints=complaints + _disagreements(runs, pooled, names))
 
 
-def _disagreements(runs: Sequence[_Run], pooled: Sample) -> list[str]:
+def _disagreements(runs: Sequence[_Run], pooled: Sample, names: Sequence[str] | None) -> list[str]:
     """List the quantities in which independent runs differ."""
     means = []
     evidences = []
@@ -660,9 +661,11 @@ def _disagreements(runs: Sequence[_Run], pooled: Sample) -> list[str]:
     apart = np.ptp(means, axis=0) / np.sqrt(np.diag(covariance))
     found = []
     if not apart.max() <= _MEANS_AGREE:
+        worst = int(apart.argmax())
+        name = f"coordinate {worst}" if names is None else names[worst]
         found.append(
-            f"two independent runs differ by {apart.max():.2f} standard deviations (limit "
-            f"{_MEANS_AGREE})"
+            f"two independent runs differ by {apart.max():.2f} standard deviations of {name} "
+            f"(limit {_MEANS_AGREE})"
         )
     gap = float(np.ptp(evidences))
     if not gap <= _EVIDENCES_AGREE + 4.0 * np.hypot(*errors):

@@ -47,6 +47,15 @@ _ROUGH_RHAT = 1.1
 """Largest R-hat of the drift and the noises that the last check accepts, with a warning."""
 _ROUGH_ESS = 50.0
 """Smallest bulk ESS of the drift and the noises that the last check accepts."""
+_NAMES_OF_FIELDS = {
+    "transition": "beta0",
+    "process_cov": "delta_w",
+    "initial_mean": "x0_mean",
+    "initial_cov": "x0_sd",
+    "noise_sd": "delta_v",
+    "shared_cov": "delta_s",
+}
+"""Names of the fields of a form as arguments of `ContactRate`."""
 _CHECKED = 100
 """Largest number of measured bounds whose drift is checked."""
 _N_STARTS = 1000
@@ -227,7 +236,7 @@ def sampled(
         starts = [prior] if known is None else [known, prior]
         with slow_bar("fit", " points", progress) as bar:
             charts = [_chart(one, target, starts, bar) for one in targets]
-            found = mixtures.sample(charts, seed)
+            found = mixtures.sample(charts, seed, target.coordinates.names)
         has_effects = target.effects is not None  # these have no gradient
         if sampler == IMPORTANCE or has_effects or (sampler == AUTO and not found.complaints):
             return _resampled(target, found, chains * draws, seed)
@@ -421,12 +430,12 @@ def _used_by_plans(
     drift = (inputs.drift + inputs.offset).reshape(n_draws, -1)[:, some]
 
     used = {"drift": drift}
-    for name, value in space._asdict().items():
+    for field, value in space._asdict().items():
         if value is None:
             continue
         # A variance is checked as the sd that the user gave, because their R-hats differ.
-        is_variance = name.endswith("_cov") and value.shape[-1] == 1
-        used[name] = np.sqrt(value) if is_variance else value
+        is_variance = field.endswith("_cov") and value.shape[-1] == 1
+        used[_NAMES_OF_FIELDS[field]] = np.sqrt(value) if is_variance else value
     return {name: v.reshape(*shape, -1) for name, v in used.items()}
 
 
