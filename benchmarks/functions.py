@@ -14,11 +14,11 @@
 - program: compare `PooledTrust().program`, passed as a function, with `sampler="nuts"` of the
   class.
 - samplers: fit functions of own_functions.py to ten missions in the terrain example by importance
-  sampling, with three seeds, and once each by trustbo's NUTS and by NumPyro's own MCMC (NUTS, 4
-  vectorised chains of 1000 + 1000 draws, otherwise with default settings). Print the CPU time
-  without compilation. Then compare the means and standard deviations of importance sampling with
-  those of a long run of NUTS. If R-hat of the long run is large, it is no reference. `--slow` adds
-  two functions that take minutes.
+  sampling and by nutpie (4 chains of 1000 + 1000 draws), with three seeds each, and once each by
+  trustbo's NUTS and by NumPyro's own MCMC (NUTS, 4 vectorised chains of 1000 + 1000 draws,
+  otherwise with default settings). Print the CPU time without compilation. Then compare the means
+  and standard deviations of importance sampling with those of a long run of NUTS. If R-hat of the
+  long run is large, it is no reference. `--slow` adds two functions that take minutes.
 - sbc: check the fits of four functions by simulation-based calibration.
 """
 
@@ -34,7 +34,9 @@ import numpyro
 import numpyro.distributions as dist
 from common import Table, arguments, parsed
 from groups import holm
+from jax.flatten_util import ravel_pytree
 from numpyro.infer import MCMC, NUTS, Predictive
+from numpyro.infer.util import initialize_model
 from own_functions import FUNCTIONS
 from own_functions import as_default as default_as_function
 from scipy import stats
@@ -194,10 +196,8 @@ def as_default(out):
     print(f"{time.process_time() - started:.0f} CPU s", flush=True)
     table = numbers_of(runs)
     print(table.pivot(index="scene", columns="case", values="lost while learning").round(4))
-    of_measure = [
-        name for name in tb.study.differences(table, "as a function") if "while learning" in name
-    ]
-    print(tb.study.differences(table, "as a function")[of_measure].round(4).to_string(), flush=True)
+    pairs = tb.study.differences(table, "as a function")
+    print(pairs[["lost while learning", "seconds"]].round(4).T.to_string(), flush=True)
 
 
 def in_terrain():
@@ -240,6 +240,9 @@ def samplers(names):
         compilation, *_ = own_mcmc(function, data, 0, warmup=FEW, n=FEW)
         seconds, diagnosed, complaints = own_mcmc(function, data, 1, warmup=1000)
         row("NumPyro", 1, seconds - compilation, diagnosed["ess_bulk"], complaints)
+        for seed in SEEDS:
+            seconds, diagnosed, complaints = by_nutpie(function, data, seed)
+            row("nutpie", seed, seconds, diagnosed["ess_bulk"], complaints)
         others.append((name, *differences(found, long)))
         print(f"  {name}: {others[-1][1:]}", file=sys.stderr, flush=True)
 
@@ -247,6 +250,38 @@ def samplers(names):
                   "R-hat of the long run", "its ESS", "its divergences")  # fmt: skip
     for cells in others:
         table.row(*cells)
+
+
+def by_nutpie(function, data, seed):
+    """Sample with nutpie, in the coordinates of NumPyro; return CPU s, diagnostics, complaints."""
+    import nutpie  # which only `make bench` installs
+
+    with jax.enable_x64(True):
+        model = initialize_model(jax.random.key(seed), function, model_kwargs=data)
+        center, unravel = ravel_pytree(model.param_info.z)
+        slope = jax.jit(jax.value_and_grad(lambda x: -model.potential_fn(unravel(x))))
+        slope(center)  # compiles
+
+    def make_density():
+        def density(x):
+            with jax.enable_x64(True):
+                value, gradient = slope(x)
+            return float(value), np.asarray(gradient)
+
+        return density
+
+    n = len(center)
+    starts = np.random.default_rng(seed)
+    compiled = nutpie.compiled_pyfunc.from_pyfunc(
+        n, make_density, lambda *_: lambda x: {"x": np.asarray(x)}, [np.dtype(float)], [(n,)],
+        ["x"], make_initial_point_fn=lambda _: np.asarray(center) + starts.uniform(-1.0, 1.0, n),
+    )  # fmt: skip
+    started = time.process_time()
+    trace = nutpie.sample(compiled, tune=1000, draws=1000, chains=4, cores=1, seed=seed,
+                          progress_bar=False)  # fmt: skip
+    seconds = time.process_time() - started
+    draws = {"x": trace["posterior"]["x"].values}
+    return seconds, *complaints_of(draws, trace["sample_stats"]["diverging"].values)
 
 
 def timed_fit(fitted, sampler, seed):
