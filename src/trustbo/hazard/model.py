@@ -315,8 +315,8 @@ def _to_dataset(
         for name, values in zip(LIMIT_NAMES, limit.T, strict=False)  # empty without a limit
     }
 
-    n = np.zeros(exists.shape, np.float32)  # each mission's are kept
-    failed = np.zeros(exists.shape, np.float32)
+    n = np.zeros(exists.shape)
+    failed = np.zeros(exists.shape)
     n[*trials.bounds.T] = trials.n
     failed[*trials.bounds.T] = trials.failed
 

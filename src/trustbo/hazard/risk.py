@@ -93,8 +93,8 @@ class BoundRisk(Summary):
                 "workspace."
             )
 
-        self.trials = hazard["trials"].values.astype(float)
-        self.failures = hazard["failures"].values.astype(float)
+        self.trials = hazard["trials"].values
+        self.failures = hazard["failures"].values
         self._difficulty = difficulty
         self._measures = [difficulty.measures.index(name) for name in names]
         self._max_slope = workspace.team.max_slope
