@@ -61,6 +61,8 @@ _MOST_KNOWN = 64
 """Number of functions that are remembered, together with their compiled code."""
 _CHANGED = ExpandedDistribution | Independent | MaskedDistribution
 """Distributions that change the shape or the mask of another one, `base_dist`."""
+_MOST_TRACED = 16
+"""Number of shapes of data whose traces are kept."""
 _AXES = ("chain", "draw")
 """Names that no variable may have."""
 
@@ -130,6 +132,7 @@ class FunctionModel:
         self.fingerprint = fingerprint(function)
         self.compiled: dict[tuple[Any, ...], Callable[..., Any]] = {}
         self._in_range: set[tuple[str, ...]] = set()  # feature names that were checked
+        self._traced: dict[Any, tuple[dict[str, Any], dict[str, Any]]] = {}  # see `_shapes`
         self._runs_again = False  # whether a check has found all sites in a second run
 
     @property
@@ -146,7 +149,7 @@ class FunctionModel:
         return f"FunctionModel({self.in_short()})"
 
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"compiled": {}}  # compiled code cannot be pickled
+        return vars(self) | {"compiled": {}, "_traced": {}}  # which cannot be pickled
 
     def in_short(self) -> str:
         """Return the name of the function."""
@@ -265,11 +268,16 @@ class FunctionModel:
         return more if is_same else trace
 
     def _shapes(self, data: Data) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Trace the function with abstract values.
+        """Trace the function with abstract values, once for each shape of the data.
 
         Returns:
             The trace, and the shapes of the latent variables in unconstrained space, by name.
         """
+        shapes = tuple((name, np.shape(values)) for name, values in arrays_of(data).items())
+        key = (data["features"], shapes)
+        if key in self._traced:
+            return self._traced[key]
+
         trace: dict[str, Any] = {}
 
         def run(key: jax.Array, arrays: dict[str, Any]) -> dict[str, Any]:
@@ -289,6 +297,10 @@ class FunctionModel:
             if self.needs_observations:  # its arrays must not be abstract
                 arrays = {}
             free = jax.eval_shape(run, jax.random.key(0), arrays)
+        if not self.needs_observations:  # else the trace depends on more than shapes
+            if len(self._traced) == _MOST_TRACED:
+                self._traced.clear()
+            self._traced[key] = trace, free
         return trace, free
 
     def _require_sites_again(self, found: Mapping[str, Any], key: jax.Array, data: Data) -> None:
