@@ -107,7 +107,12 @@ class Nearby(NamedTuple):
 
     lam: np.ndarray  # (node, block, row), like the next two
     eta: np.ndarray
-    log_ratio: np.ndarray  # of the masses of the cavity times the likelihood term, and the site
+    log_ratio: np.ndarray
+    """Log ratio of the masses of the cavity times the likelihood term, and times the site.
+
+    A site is the density N(y; f, 1 / lam) if noise is added to the predictor. Otherwise, it is
+    exp(eta f - lam f^2 / 2), which changes smoothly with the noise sd even if lam is nearly 0.
+    """
 
     @classmethod
     def from_sites(cls, joint: Joint, sites: Sites) -> Self:
@@ -124,7 +129,10 @@ class Nearby(NamedTuple):
         m, v = (np.broadcast_to(x, (len(sd), *rates.y.shape)) for x in (cavity.mean, v))
         log_mass, mean, var = rates.likelihood.moment_match(rates.y, rates.n_ticks, m, v, sd)
         found = _matched(rates, 1.0 / v, m / v, mean, np.maximum(var, _LEAST_VARIANCE))
-        return cls(*found, _log_ratios(rates, found, log_mass, m, v))
+        log_ratio = _log_ratios(rates, found, log_mass, m, v)
+        if not rates.likelihood.adds_noise:
+            log_ratio = log_ratio + _log_constants(rates, found)
+        return cls(*found, log_ratio)
 
     def at(self, rates: Rates, sd: np.ndarray) -> tuple[Sites, np.ndarray]:
         """Return the sites of the predictors, and the log ratios of all rates (point,)."""
@@ -135,8 +143,9 @@ class Nearby(NamedTuple):
         else:
             w = _SPLINE(np.clip(np.log(sd), _LOG_SDS[0], _LOG_SDS[-1]))
             lam, eta, log_ratio = (_weighted(w, values) for values in self)
-            log_ratio = log_ratio.sum((1, 2))
-        return Sites(np.maximum(lam, 0.0), eta).at(rates, sd), log_ratio
+            lam = np.where(np.isnan(rates.y), 0.0, np.maximum(lam, _LEAST))
+            log_ratio = (log_ratio - _log_constants(rates, Sites(lam, eta))).sum((1, 2))
+        return Sites(lam, eta).at(rates, sd), log_ratio
 
 
 def _weighted(w: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -158,6 +167,14 @@ def nearby(joint: Joint, near: Nearby) -> Fit:
     sites, log_ratio = near.at(rates, predictor.noise_sd)
     fit = evidence(blocks, predictor, prior, sites.lam, sites.y)
     return fit._replace(log_p=fit.log_p + log_ratio)
+
+
+def _log_constants(rates: Rates, sites: Sites) -> np.ndarray:
+    """Compute log N(y; f, 1 / lam) - (eta f - lam f^2 / 2) of each site, which is constant in f."""
+    is_exact = np.isnan(rates.y) | rates.linear
+    lam = np.where(is_exact, 1.0, sites.lam)
+    constant = 0.5 * (np.log(lam / (2.0 * np.pi)) - sites.eta**2 / lam)
+    return np.where(is_exact, 0.0, constant)
 
 
 def _log_ratios(

@@ -58,7 +58,7 @@ class AddedEffects:
         designs = [effect.design(observations) for effect in effects]
         self._ends = np.cumsum([0, *(U.shape[1] for U in designs)])
         self._U = sparse.csr_array(sparse.hstack(designs, format="csr"))
-        self._known: dict[bool, tuple[Layout, Blocks]] = {}
+        self._known: tuple[Layout, Blocks] | None = None  # see `_blocks`
 
         self._log_resolution = 0.0
         of_ticks = FAMILIES["gaussian"].log_resolution(
@@ -151,8 +151,8 @@ class AddedEffects:
 
     def _blocks(self, space: StateSpace, prior: Prior) -> tuple[Layout, Blocks]:
         """Return the layout and the blocks of the rates, which are the same at all points."""
-        is_joint = space.n_members > 1
-        if is_joint not in self._known:
+        if self._known is None:
+            is_joint = space.n_members > 1
             layout = Layout.from_rates(self.observations.contact_rate, joint=is_joint)
             n_groups = space.transition.shape[1]
             label = layout.label
@@ -160,5 +160,5 @@ class AddedEffects:
                 label = np.tile(np.arange(n_groups), self.observations.n_missions)
             y = layout.rows(self.observations.contact_rate)
             blocks = Blocks.from_rows(y, layout.design(self._U), label, prior=prior)
-            self._known[is_joint] = layout, blocks
-        return self._known[is_joint]
+            self._known = layout, blocks
+        return self._known
