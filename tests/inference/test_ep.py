@@ -1,13 +1,16 @@
 """Expectation propagation against quadrature over the linear predictors of small cases."""
 
+from dataclasses import replace
+
 import numpy as np
+import numpyro.distributions as dist
 import pytest
 from dense_coefficients import DenseRates
 from dense_families import by_quadrature, of_one_report, with_one_limit
 from every_model import FEATURES, GRID, models_of
 
 from trustbo.inference.density import Density
-from trustbo.models import HumanTrust
+from trustbo.models import HumanTrust, PooledTrust, Priors
 from trustbo.models.observations import Observations
 from trustbo.models.visited import visited
 
@@ -78,6 +81,24 @@ def test_the_density_near_the_theta_of_ep_is_that_of_ep(name, family):
             near
         )
         np.testing.assert_allclose(posterior.log_density(near), ep_density, atol=error)
+
+
+def test_counts_far_below_their_prediction_keep_the_density_finite():
+    """There, the term of the counts is convex in trust, so a site has almost no precision."""
+    priors = replace(
+        Priors.default("beta_binomial"), b=dist.Normal(10.0, 0.05), beta=dist.Normal(0.0, 0.01)
+    )
+    model = PooledTrust(family="beta_binomial", priors=priors)
+    rates = np.full((1, 1, 1), 0.8562)
+    observations = Observations(rates, np.zeros((1, 1, 1, 1)), np.full((1, 1, 1), 146.0), ("a",))
+    posterior = Density(model, observations)
+
+    z = np.zeros((40, posterior.n_scores))
+    z[:, posterior.scores.noises] = np.linspace(-2.5, 1.0, 40)[:, None]
+    posterior.run_ep(posterior.theta(z[20:21]))
+    assert (posterior.near.lam < 1e-8).any()
+    ep_density = posterior.log_evidence(posterior.theta(z)) + posterior.scores.log_prior(z)
+    np.testing.assert_allclose(posterior.log_density(z), ep_density, atol=0.4)
 
 
 def people(scale, change=None):
