@@ -86,7 +86,10 @@ def test_the_density_near_the_theta_of_ep_is_that_of_ep(name, family):
 def test_counts_far_below_their_prediction_keep_the_density_finite():
     """There, the term of the counts is convex in trust, so a site has almost no precision."""
     priors = replace(
-        Priors.default("beta_binomial"), b=dist.Normal(10.0, 0.05), beta=dist.Normal(0.0, 0.01)
+        Priors.default("beta_binomial"),
+        beta=dist.Normal(0.0, 0.01),
+        b=dist.Normal(10.0, 0.05),
+        stationary=True,
     )
     model = PooledTrust(family="beta_binomial", priors=priors)
     rates = np.full((1, 1, 1), 0.8562)
