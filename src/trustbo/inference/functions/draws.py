@@ -1,6 +1,6 @@
 """Draws of a model that is a NumPyro function."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from typing import Any
 
@@ -335,9 +335,7 @@ class FunctionDraws(Draws):
 
         other = copy(self)
         other._is_flat = np.ndim(index) > 0  # the mean is the only draw
-        if self.effects is not None:
-            other.effects = self.effects.draw(index)
-        return other
+        return other._with_effects(lambda effects: effects.draw(index))
 
     def _some(self, index: Any) -> "FunctionDraws":
         """Return some of the draws, also if the object is a mean."""
@@ -346,9 +344,7 @@ class FunctionDraws(Draws):
         other._numbers = self._numbers[index]
         other._of_mean = False
         other._form = None
-        if self.effects is not None:
-            other.effects = self.effects.draw(index)
-        return other
+        return other._with_effects(lambda effects: effects.draw(index))
 
     def mean(self) -> "FunctionDraws":
         """Average the form and the inputs over all draws; see `Draws.mean`."""
@@ -357,9 +353,7 @@ class FunctionDraws(Draws):
             other._of_mean = True
             other._form = None
         other._is_flat = False
-        if other.effects is not None:
-            other.effects = other.effects.mean()
-        return other
+        return other._with_effects(lambda effects: effects.mean())
 
     def flat(self) -> "FunctionDraws":
         """See `Draws.flat`."""
@@ -367,9 +361,13 @@ class FunctionDraws(Draws):
         other.values = self._flat_values()
         other._numbers = np.atleast_1d(self._numbers)
         other._is_flat = True
+        return other._with_effects(lambda effects: effects.flat())
+
+    def _with_effects(self, change: Callable[[Params], Params]) -> "FunctionDraws":
+        """Change the effects of a new object, if there are any, and return the object."""
         if self.effects is not None:
-            other.effects = self.effects.flat()
-        return other
+            self.effects = change(self.effects)
+        return self
 
     def record(self) -> dict[str, Any]:
         """See `Draws.record`."""

@@ -91,7 +91,7 @@ def fit_function(
     of_counts = resolution > 0.0
     effects = _effects_in(model, data, observations, missions, workspace, of_counts=of_counts)
     if effects is not None:
-        require_integrable(model, sampler)
+        _require_integrable(model, sampler)
     if draws is None:
         draws = default_draws(effects.effects if effects else (), sampler)
 
@@ -129,7 +129,7 @@ def fit_function(
     return tree, drawn.complaints
 
 
-def require_integrable(model: FunctionModel, sampler: str) -> None:
+def _require_integrable(model: FunctionModel, sampler: str) -> None:
     """Raise TrustboError if a sampler does not integrate the effects of a function out."""
     if sampler == NUTS:
         raise TrustboError(
@@ -408,7 +408,7 @@ def require_learnable(model: FunctionModel, workspace: Workspace, *, by_gradient
     sites = model.sites(data)
     if by_gradient:
         if model.effects(data):
-            require_integrable(model, NUTS)
+            _require_integrable(model, NUTS)
         require_gradient(model, targets_of(model, data, sites)[0].coordinates, data)
     if not model.needs_observations:  # its data are not padded
         require_unpadded_results(model, data, sites, [len(known)])
