@@ -462,7 +462,7 @@ def load_result(
         directory: Folder of a campaign, or a folder written by `Result.save`.
         model: Model of the campaign; needed if it is a NumPyro function, or if it is custom and
             nothing has been learned.
-        progress: Whether to show a progress bar if `posterior` takes longer than 2 seconds.
+        progress: Whether to show a progress bar if `posterior` takes longer than 1.5 seconds.
 
     Raises:
         TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is

@@ -53,7 +53,7 @@ def compare(
         round_to: Number of decimal places, as in `arviz.compare`. `"auto"`, the default of ArviZ,
             rounds `elpd` to the precision of its standard error, which hides smaller differences
             between models. The default `"none"` does not round.
-        progress: Whether to show a progress bar after 2 seconds.
+        progress: Whether to show a progress bar after 1.5 seconds.
 
     Returns:
         Table from `arviz.compare` with one row per posterior, the best first. The columns include

@@ -123,7 +123,7 @@ def fit(
         warmup: Number of warm-up draws per NUTS chain, which are discarded. The default is 150 for
             Gaussian rates, for which only the step size is tuned, and 300 otherwise.
         seed: Random seed; the same seed gives the same posterior.
-        progress: Whether to show a progress bar; importance sampling shows it after 2 seconds.
+        progress: Whether to show a progress bar; importance sampling shows it after 1.5 seconds.
         check: Whether to raise an error if the diagnostics are bad. For importance sampling, this
             means k-hat > 0.7; for NUTS, R-hat > 1.01, bulk ESS < 400 or any divergence.
         latent: Whether to add latent trust, log-likelihoods and predictions, as `add_latent` does.

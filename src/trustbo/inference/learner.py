@@ -427,7 +427,7 @@ def add_latent(
         missions: Fitted missions; needed if the posterior contains no data.
         model: Model of the posterior; needed if the priors are custom, or if it is a NumPyro
             function that was not used before in this process.
-        progress: Whether to show a progress bar after 2 seconds.
+        progress: Whether to show a progress bar after 1.5 seconds.
 
     Returns:
         The posterior with the groups `latent`, `posterior_predictive`, `prior_predictive`,

@@ -111,7 +111,7 @@ def loo(posterior: xr.DataTree, *, model: Model | None = None, progress: bool = 
             cannot be refitted.
         model: Model of the posterior; needed if the priors are custom, or if it is a NumPyro
             function that was not used before in this process.
-        progress: Whether to show a progress bar after 2 seconds.
+        progress: Whether to show a progress bar after 1.5 seconds.
 
     Returns:
         Pointwise `ELPDData` of ArviZ for `az.compare({name: loo(posterior), ...})`. Missions have

@@ -204,7 +204,7 @@ def with_latent(
         fitted: Density of the model given the missions.
         draws: Draws as read from the posterior, so that a later call of `add_latent` gives the same
             result.
-        progress: Whether to show a progress bar after 2 seconds.
+        progress: Whether to show a progress bar after 1.5 seconds.
     """
     fitted.reset_ep()
     fitted.run_ep(draws.theta)

@@ -96,7 +96,7 @@ class Chains:
         warmup: Number of draws per chain that tune the kernel and are discarded.
         accept: Target of the acceptance probability.
         seed: Random seed.
-        progress: Whether to show a progress bar, after 2 seconds.
+        progress: Whether to show a progress bar, after 1.5 seconds.
     """
 
     def __init__(

@@ -226,7 +226,7 @@ def sampled(
         draws: Number of draws per chain; importance sampling draws as many in one chain.
         warmup: Number of warm-up draws per chain.
         seed: Random seed.
-        progress: Whether to show progress bars after 2 seconds.
+        progress: Whether to show progress bars after 1.5 seconds.
         check: Whether NUTS is continued until its diagnostics are good.
     """
     target = targets[0]
