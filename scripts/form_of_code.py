@@ -1,8 +1,9 @@
-"""Print the form of Python code: blank lines, tuple assignments, comments, longest functions.
+"""Print the size and form of Python code: syntax nodes, blank lines, comments, longest functions.
 
     python scripts/form_of_code.py FOLDER [FOLDER ...]
 
 Each folder is a package, such as src/trustbo, or the source of another library to compare it with.
+Nodes are those of the abstract syntax tree, which packing code into fewer lines does not lower.
 Blank lines and comments are shares of the lines of function bodies, without docstrings. Tuple
 assignments give several values to as many names in one statement, as in `a, b = f(x), g(y)`, per
 1000 lines of code. Compare these figures between libraries; they are no targets.
@@ -22,6 +23,9 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 class Form(NamedTuple):
     """Figures of one package."""
 
+    n_nodes: int
+    n_functions: int
+    n_files: int
     n_lines: int
     blank: float
     comments: float
@@ -36,19 +40,25 @@ def main() -> None:
     parser.add_argument("--longest", type=int, default=3, help="longest functions to name")
     given = parser.parse_args()
 
-    print("| folder | lines | blank in bodies | comments in bodies | tuples per 1000 | longest |")
-    print("|---|---:|---:|---:|---:|---|")
+    print(
+        "| folder | nodes | functions | files | lines "
+        "| blank in bodies | comments in bodies | tuples per 1000 | longest |"
+    )
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---|")
     for folder in given.folders:
         form = form_of(folder)
         longest = ", ".join(f"{name} {n}" for n, name in form.longest[: given.longest])
         print(
-            f"| {folder} | {form.n_lines} | {form.blank:.1%} | {form.comments:.1%} "
+            f"| {folder} | {form.n_nodes} | {form.n_functions} | {form.n_files} "
+            f"| {form.n_lines} | {form.blank:.1%} | {form.comments:.1%} "
             f"| {form.tuples:.1f} | {longest} |"
         )
 
 
 def form_of(folder: Path) -> Form:
     """Measure all Python files below a folder."""
+    n_nodes = 0
+    n_files = 0
     n_lines = 0
     n_body = 0
     n_blank = 0
@@ -61,6 +71,8 @@ def form_of(folder: Path) -> Form:
         tree = ast.parse(text)
         lines = text.splitlines()
         comments = lines_with_comments(text)
+        n_nodes += sum(1 for _ in ast.walk(tree))
+        n_files += 1
         n_lines += len(lines)
         n_tuples += sum(is_tuple_assignment(node) for node in ast.walk(tree))
 
@@ -75,6 +87,9 @@ def form_of(folder: Path) -> Form:
 
     longest.sort(reverse=True)
     return Form(
+        n_nodes=n_nodes,
+        n_functions=len(longest),
+        n_files=n_files,
         n_lines=n_lines,
         blank=n_blank / max(n_body, 1),
         comments=n_comments / max(n_body, 1),
