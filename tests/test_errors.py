@@ -12,7 +12,7 @@ import trustbo as tb
 from trustbo import errors
 from trustbo.inference import TrustFilter, fit, params_of
 from trustbo.inference.diagnostics import diagnostics
-from trustbo.models import CoupledTrust, HierarchicalTrust, HumanTrust, PooledTrust, Priors
+from trustbo.models import PooledTrust, Priors
 from trustbo.planning import Planner
 from trustbo.planning.policies import optimistic
 from trustbo.simulation import KinematicSimulator, ModelSimulator, ReplaySimulator, Truth
@@ -100,21 +100,6 @@ MISTAKES = {
     "no cases": (lambda w: tb.study.run_grid({}, {}, "study"), "case"),
     "a column as a number": (lambda w: tb.logs.read_reports({}, person=3, inputs=["x"]), "person"),
 }
-RENAMED = {
-    "latent": (lambda w: fit([made()], whole=False), "whole"),
-    "add_latent": (lambda w: tb.inference.complete(None), "complete"),
-    "expected_trust": (lambda w: tb.planning.roll_trust(PARAMS, Z), "roll_trust"),
-    "next_mission": (lambda w: params_of(None, day=True), "day"),
-    "tau_mission": (lambda w: tb.models.RobotEffect(tau_day=0.1), "tau_day"),
-    "bound_cost": (lambda w: Planner(w, *ENDS, toll=0.1), "toll"),
-    "family": (lambda w: PooledTrust(observation="censored"), "observation"),
-    "from_features": (lambda w: Priors.of(("a",)), "Priors.of"),
-    "from_simulator": (lambda w: Truth.of(None), "Truth.of"),
-    "from_space": (lambda w: tb.models.ContactRate.of(None, None), "ContactRate.of"),
-    "components": (lambda w: Planner(w, *ENDS).with_risk(None, strata=None), "strata"),
-    "trials": (lambda w: tb.hazard.BoundRisk.exposures, "BoundRisk.exposures"),
-}
-"""Calls with an old name, by the new name, with the old name."""
 HUGE = {
     "n_robots": lambda w, n: tb.Team(n),
     "draws": lambda w, n: fit([made()], draws=n),
@@ -142,28 +127,6 @@ def test_bad_input_is_refused_by_name(mistake, workspace, tmp_path, monkeypatch)
         make(workspace)
     assert "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("new", RENAMED)
-def test_an_old_name_is_answered_with_the_new_one(new, workspace):
-    call, old = RENAMED[new]
-    with pytest.raises(tb.TrustboError, match=rf"{old}'? is now called '{new}'"):
-        call(workspace)
-
-
-def test_old_attributes_are_answered_and_no_others():
-    model = HierarchicalTrust(family="censored")
-    with pytest.raises(tb.TrustboError, match="'family'"):
-        model.observation  # noqa: B018
-    assert not hasattr(model, "observation")
-    with pytest.raises(AttributeError, match="families"):
-        model.families  # noqa: B018
-
-
-@pytest.mark.parametrize("kind", [PooledTrust, HierarchicalTrust, CoupledTrust, HumanTrust])
-def test_every_model_answers_the_old_name_of_its_family(kind):
-    with pytest.raises(tb.TrustboError, match="'family'"):
-        kind(observation="censored")
 
 
 def test_other_names_are_refused_as_python_does():

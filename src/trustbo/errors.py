@@ -1,13 +1,11 @@
 """Errors that trustbo raises for invalid input; each is also a ValueError."""
 
 import contextlib
-import functools
-import inspect
 import math
 import operator
 import unicodedata
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -232,76 +230,3 @@ def require_bounds(what: str, value: object) -> tuple[tuple[tuple[int, int], ...
             raise TrustboError(f"{what}[{k}] must be two cells; got {one_line(bound)}.")
         pairs.append(cells)
     return tuple(pairs)
-
-
-class Renamed:
-    """Decorator for a function or class whose arguments got new names.
-
-    A call with an old name raises a TrustboError that gives the new one. If a class is decorated,
-    its attributes also have the new names.
-
-    Example:
-        >>> @Renamed(whole="latent")
-        >>> def fit(missions, latent=True): ...
-    """
-
-    def __init__(self, **new_names: str) -> None:
-        self._new_names = new_names
-
-    def __call__[T: Callable[..., Any]](self, decorated: T) -> T:
-        """Return the function or class with checks for the old names."""
-        if not inspect.isclass(decorated):
-            return self._checked(decorated)
-
-        owner: Any = decorated
-        owner.__init__ = self._checked(owner.__init__)
-        for old, new in self._new_names.items():
-            setattr(owner, old, OldName(new, old))
-        return owner
-
-    def _checked(self, function: Any) -> Any:
-        """Wrap a function to refuse arguments with old names."""
-        name = function.__qualname__.removesuffix(".__init__")
-
-        @functools.wraps(function)
-        def checked(*args: Any, **options: Any) -> Any:
-            for old in self._new_names.keys() & options:
-                raise TrustboError(f"{name}: {old!r} is now called {self._new_names[old]!r}.")
-            return function(*args, **options)
-
-        return checked
-
-
-class OldName:
-    """Old name of an attribute or a constructor; using it raises an error with the new name.
-
-    Example:
-        >>> class Priors:
-        >>>     of = OldName("from_features")
-    """
-
-    def __init__(self, new: str, old: str = "") -> None:
-        self._new = new
-        self._old = old
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._old = name
-
-    def __get__(self, instance: object, owner: type) -> Any:
-        """Raise RenamedAttributeError."""
-        raise RenamedAttributeError(f"{owner.__name__}.{self._old} is now called {self._new!r}.")
-
-
-class RenamedAttributeError(TrustboError, AttributeError):
-    """Error for the old name of an attribute; `hasattr` is False, as for other missing names."""
-
-
-def renamed_names(module: str, **new_names: str) -> Callable[[str], Any]:
-    """Return a module's `__getattr__` that raises a TrustboError for old names in the module."""
-
-    def refuse(name: str) -> Any:
-        if name in new_names:
-            raise TrustboError(f"{module}.{name} is now called {new_names[name]!r}.")
-        raise AttributeError(f"module {module!r} has no attribute {name!r}")
-
-    return refuse

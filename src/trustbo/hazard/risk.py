@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import in_order, read_labelled
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
-from trustbo.errors import OldName, Renamed, TrustboError, one_line, require_whole
+from trustbo.errors import TrustboError, one_line, require_whole
 from trustbo.hazard.components import Components, partition
 from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, prior_betas, steepness_of
 from trustbo.workspace import Workspace
@@ -56,9 +56,6 @@ class BoundRisk(Summary):
         >>> risk = tb.hazard.BoundRisk(tb.hazard.fit_hazard(missions, workspace), workspace)
         >>> draws = risk.draw(100)  # failure probabilities, leading axis (draw,)
     """
-
-    exposures = OldName("trials")
-    strata = OldName("components")
 
     def __init__(self, hazard: xr.Dataset, workspace: Workspace) -> None:
         """Read the group `hazard` of a posterior (see `fit_hazard`) for a workspace.
@@ -389,7 +386,6 @@ def failure_in(components: Components, path: Sequence[Cell] | np.ndarray) -> flo
     return float(weights @ (1.0 - np.prod(1.0 - p_fail[:, *index], axis=1)))
 
 
-@Renamed(strata="components")
 @dataclass(frozen=True, eq=False, repr=False)
 class Risk(Summary):
     """Given probability that each bound of a workspace ends the mission.

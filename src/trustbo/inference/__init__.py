@@ -3,7 +3,6 @@
 from trustbo.models import backend as backend  # imported first because it loads numpyro
 
 # isort: split
-from trustbo.errors import renamed_names
 from trustbo.inference.by_rate import by_rate
 from trustbo.inference.compare import compare
 from trustbo.inference.draws import sample_prior
@@ -26,5 +25,4 @@ __all__ = [
     "sample_prior",
     "score",
 ]
-__getattr__ = renamed_names(__name__, complete="add_latent")
 __dir__ = __all__.copy  # tab completion lists only public names

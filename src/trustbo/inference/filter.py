@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import Names, evenly_spaced, read_labelled
 from trustbo.data import Cell, require_shares, require_unit_interval
-from trustbo.errors import Renamed, TrustboError, one_line, require_pair, require_whole
+from trustbo.errors import TrustboError, one_line, require_pair, require_whole
 from trustbo.inference.draws import as_fitted
 from trustbo.inference.importance import systematic
 from trustbo.inference.learner import params_of
@@ -91,7 +91,6 @@ class TrustFilter:
         >>> trust.predict(awareness[1:], path[1:]).rate  # contact rates of the bounds to come
     """
 
-    @Renamed(observation="family")
     @computing()
     def __init__(
         self,

@@ -13,7 +13,6 @@ from trustbo.data import Mission
 from trustbo.display import slow_bar
 from trustbo.errors import (
     PosteriorError,
-    Renamed,
     TrustboError,
     require_choice,
     require_count,
@@ -74,7 +73,6 @@ _MANY_SCORES = 12
 """Smallest number of scores for which a round has four times as many points."""
 
 
-@Renamed(whole="latent")
 @computing()
 def fit(
     missions: Iterable[Mission],

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Protocol
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import Renamed, TrustboError, require_kind, see
+from trustbo.errors import TrustboError, require_kind, see
 from trustbo.inference.draws import (
     as_fitted,
     expected_and_drawn_of_model,
@@ -361,7 +361,6 @@ def learner_of_posterior(posterior: xr.DataTree, model: Model | None = None) -> 
     return ClassLearner(model)  # pyright: ignore[reportArgumentType]
 
 
-@Renamed(day="next_mission")
 @computing()
 def params_of(
     posterior: xr.DataTree,

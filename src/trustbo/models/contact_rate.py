@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 from numpyro.distributions import constraints
 
 from trustbo.display import joined
-from trustbo.errors import OldName, TrustboError, require_list
+from trustbo.errors import TrustboError, require_list
 from trustbo.models.effects.effect import Effect, SampledEffect
 from trustbo.models.observations import median_resolution
 from trustbo.statespace import Inputs, StateSpace, kalman
@@ -160,8 +160,6 @@ class ContactRate(dist.Distribution):
             if not (isinstance(offset, int | float) and offset == 0):
                 raise TrustboError("effects cannot be combined with an offset; leave one out.")
             self.effects, self.theta = _read_effects(effects, values)
-
-    of = OldName("from_space")
 
     @classmethod
     def from_space(

@@ -8,7 +8,6 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 
-from trustbo.errors import Renamed
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import CoupledWeights
 from trustbo.models.model import TrustModel
@@ -18,7 +17,6 @@ from trustbo.statespace.form import coupled_robots
 from trustbo.statespace.matrices import namespace
 
 
-@Renamed(observation="family")
 @dataclass(frozen=True, repr=False)
 class CoupledTrust(TrustModel):
     """Model in which robots have separate parameters and influence each other, equations (1)-(2).

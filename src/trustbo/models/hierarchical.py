@@ -7,12 +7,10 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 
-from trustbo.errors import Renamed
 from trustbo.models.effects.weights import RobotWeights
 from trustbo.models.pooled import PooledTrust
 
 
-@Renamed(observation="family")
 @dataclass(frozen=True, repr=False)
 class HierarchicalTrust(PooledTrust):
     """Model with separate coefficients for each robot, partially pooled towards a common mean.

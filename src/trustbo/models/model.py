@@ -14,7 +14,7 @@ from scipy import sparse
 
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary
-from trustbo.errors import Renamed, TrustboError, require_choice, require_list
+from trustbo.errors import TrustboError, require_choice, require_list
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Effect, Theta, sample_coefficients
 from trustbo.models.effects.weights import Weights
@@ -40,7 +40,6 @@ _PRIOR_OF = {
 _JITTER = 1e-13  # added to the covariance of trust, which rounding could make singular
 
 
-@Renamed(observation="family")
 @dataclass(frozen=True, repr=False)
 class TrustModel(Summary, ABC):
     """Base class of trust models.

@@ -9,7 +9,7 @@ import numpyro.distributions as dist
 
 from trustbo.data import levels_of
 from trustbo.display import Rows
-from trustbo.errors import Renamed, TrustboError, require_choice, require_positive
+from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import Theta
 from trustbo.models.families import FAMILIES, Family, Levels
@@ -26,7 +26,6 @@ SDS = "tau_start", "tau_level", "tau_gain"
 """Names of the standard deviations of the personal coefficients."""
 
 
-@Renamed(observation="family")
 @dataclass(frozen=True, repr=False)
 class HumanTrust(PooledTrust):
     """Model of self-reported trust as a base level plus decaying effects of past outcomes.

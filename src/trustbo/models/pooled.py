@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpyro.distributions import Distribution
 
-from trustbo.errors import Renamed, TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import Weights
 from trustbo.models.model import TrustModel
@@ -16,7 +16,6 @@ from trustbo.statespace import StateSpace
 from trustbo.statespace.form import independent_robots
 
 
-@Renamed(observation="family")
 @dataclass(frozen=True, repr=False)
 class PooledTrust(TrustModel):
     """Model with one set of parameters for all robots, equations (3)-(4).

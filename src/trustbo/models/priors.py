@@ -13,7 +13,6 @@ from numpyro.distributions import Distribution
 from trustbo.data import is_line_of_sight
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
-    OldName,
     TrustboError,
     require_choice,
     require_finite,
@@ -143,8 +142,6 @@ class Priors(Summary):
             if self is _DEFAULTS.get(family):
                 return Priors.default, (family,)
         return super().__reduce_ex__(protocol)
-
-    of = OldName("from_features")
 
     @classmethod
     def from_features(cls, features: Sequence[str], family: str = "gaussian") -> "Priors":

@@ -1,6 +1,5 @@
 """Search for the most trustworthy path, given a posterior of the trust model."""
 
-from trustbo.errors import renamed_names
 from trustbo.planning import policies, reference
 from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.paths import NoPathError
@@ -21,5 +20,4 @@ __all__ = [
     "policies",
     "reference",
 ]  # fmt: skip
-__getattr__ = renamed_names(__name__, roll_trust="expected_trust")
 __dir__ = __all__.copy  # tab completion lists only public names

@@ -14,7 +14,6 @@ from trustbo.arrays import read_labelled
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
-    Renamed,
     TrustboError,
     require_bounds,
     require_choice,
@@ -64,7 +63,6 @@ class Planner(Summary):
         >>> planner.plan(posterior).path
     """
 
-    @Renamed(toll="bound_cost")
     def __init__(
         self,
         workspace: Workspace,
@@ -217,7 +215,6 @@ class Planner(Summary):
 
         return self._with(paths=self.problem.paths.avoiding(avoided > 0.0, risks))
 
-    @Renamed(strata="components")
     def with_risk(
         self,
         p_fail: BoundRisk | ArrayLike,

@@ -14,7 +14,7 @@ import xarray as xr
 
 from trustbo.data import Cell
 from trustbo.display import Rows, Summary, announced
-from trustbo.errors import OldName, TrustboError, require_count, require_whole
+from trustbo.errors import TrustboError, require_count, require_whole
 from trustbo.files import FilePath, to_json, to_path, write_file
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.paths import AdmissiblePaths, NoPathError
@@ -54,8 +54,6 @@ class Truth(Summary):
         rows, cols = self.workspace.grid.shape
         worlds = "one" if self._of is None else "one for each mission; see at(mission)"
         return [("bounds", f"of {rows} x {cols} cells"), ("worlds", worlds)]
-
-    of = OldName("from_simulator")
 
     @classmethod
     def from_simulator(

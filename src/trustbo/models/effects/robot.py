@@ -15,13 +15,12 @@ import numpy as np
 from numpy.random import Generator
 from scipy import sparse
 
-from trustbo.errors import Renamed, require_share
+from trustbo.errors import require_share
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.statespace.matrices import namespace
 
 
-@Renamed(tau_day="tau_mission")
 @dataclass(frozen=True)
 class RobotEffect(Effect):
     """Effect of a robot in a mission, proportional to the predicted line of sight.
