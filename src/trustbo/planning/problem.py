@@ -17,7 +17,8 @@ from trustbo.inference.learner import expected_and_drawn, params_of
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES, Family
 from trustbo.models.params import ParameterDraws
-from trustbo.planning.labels import LOGISTIC, LOSSES, TINY_SD, Costs, best_labels
+from trustbo.planning.labels import best_labels
+from trustbo.planning.limits import LOGISTIC, LOSSES, TINY_SD, Costs
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.recursion import Recursion, trust_recursion
