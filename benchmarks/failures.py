@@ -32,7 +32,7 @@ from common import Table, arguments, parsed
 
 import trustbo as tb
 from trustbo.hazard import Hazard
-from trustbo.hazard.risk import Risk
+from trustbo.hazard.given import GivenRisk
 from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.replicates import replicated
 from trustbo.study import worlds
@@ -169,7 +169,7 @@ def print_price():
 
 def chances(risk, path):
     """Compute the failure probability of a path from means, components, and 20 000 draws."""
-    risks = Risk(risk.mean), Risk(risk.mean, components=risk.components())
+    risks = GivenRisk(risk.mean), GivenRisk(risk.mean, components=risk.components())
     joint = [one.failure(path) for one in risks]
     drawn = risk.draw(20_000, seed=1)[:, *bounds_and_next(path).T]
     return [f"{p:.3f}" for p in (*joint, 1.0 - np.prod(1.0 - drawn, axis=1).mean())]

@@ -13,7 +13,7 @@ from numba import njit
 import trustbo as tb
 from trustbo import display
 from trustbo.display import Summary
-from trustbo.hazard.risk import Risk
+from trustbo.hazard.given import GivenRisk
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,
@@ -62,7 +62,7 @@ def test_every_object_is_displayed():
         workspace, workspace.grid, workspace.team, mission,
         planner, planner.plan(params), params, Priors(), PooledTrust(), simulator,
         default_model(), CoupledTrust(Priors.for_cells()), HierarchicalTrust(), HumanTrust(),
-        Risk(np.full((8, 3, 3, 9), 0.1)),
+        GivenRisk(np.full((8, 3, 3, 9), 0.1)),
     ]  # fmt: skip
     for one in objects:
         assert 1 < len(repr(one).splitlines()) < 20

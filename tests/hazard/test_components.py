@@ -7,6 +7,7 @@ import pytest
 
 import trustbo as tb
 from trustbo.hazard.components import partition
+from trustbo.hazard.given import GivenRisk
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import LostMission
@@ -66,7 +67,7 @@ def test_mean_over_strata_is_that_over_all_draws(risk):
 def test_few_strata_have_the_chance_to_fail_that_all_draws_have(risk):
     """Against 10 000 draws of the chances themselves; the product of means is far above."""
     risk, path = risk
-    planner_risks = [tb.hazard.risk.Risk(risk.mean, components=risk.components(n)) for n in (1, 5)]
+    planner_risks = [GivenRisk(risk.mean, components=risk.components(n)) for n in (1, 5)]
     product, five = (of_path.failure(path) for of_path in planner_risks)
     index = bounds_and_next(path).T
     drawn = 1.0 - np.prod(1.0 - risk.draw(10_000, seed=1)[:, *index], axis=1)
@@ -96,4 +97,4 @@ def test_a_planner_searches_with_the_components_of_a_risk(workspace, risk):
     own = planner.with_risk(risk).problem
     given = planner.with_risk(risk.mean, components=risk.components()).problem
     assert own.risk.failure(path) == given.risk.failure(path)
-    np.testing.assert_array_equal(own.risks.of_edges, given.risks.of_edges)
+    np.testing.assert_array_equal(own.edge_risks.of_edges, given.edge_risks.of_edges)

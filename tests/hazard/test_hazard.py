@@ -365,7 +365,7 @@ def test_a_failed_bound_has_a_higher_risk_and_a_completed_one_a_lower():
     assert risk.mean[first] < risk.mean[never] < 0.1
     assert prior_risk(ws).mean[never] < risk.mean[never]
     assert risk.mean[second] > 0.6
-    assert risk.stopped[second] == 3
+    assert risk.past_failures[second] == 3
     assert np.isnan(risk.mean[4, 0, 0]).all()  # no cell west of the grid
     # Without a terrain, nothing says how next moves differ: they share what was learned.
     np.testing.assert_array_equal(risk.mean[4, 0, 2, 0], risk.mean[second])

@@ -12,7 +12,7 @@ from trustbo.campaign.learning import as_learned
 from trustbo.campaign.result import Result
 from trustbo.data import Cell, Mission, path_text
 from trustbo.errors import TrustboError
-from trustbo.hazard.risk import PathRisk
+from trustbo.hazard.path_risk import PathRisk
 from trustbo.hazard.trials import CAUSES
 from trustbo.inference import TrustFilter
 from trustbo.planning import Plan

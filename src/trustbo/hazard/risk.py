@@ -1,41 +1,34 @@
-"""Risk: posterior failure probabilities of bounds and paths, for planning."""
+"""Posterior failure probabilities of bounds and paths, for planning."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
 
-from trustbo.arrays import in_order, read_labelled
+from trustbo.arrays import in_order
 from trustbo.data import Cell
-from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, one_line, require_whole
+from trustbo.display import Rows
+from trustbo.errors import TrustboError, require_whole
 from trustbo.hazard.components import Components, partition
+from trustbo.hazard.path_risk import BAND, PathRisk, Risk
 from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, prior_betas, steepness_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import TILT
 from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES, bounds_and_next
 
-ROUNDING = 1e-12
-"""Tolerance for rounding errors when the risk of a path is compared with its limit."""
 _DIMS = ("draw", "lost", "measure", "bound", "axis", "move", "row", "col", "next_move")
 """Axes of the group `hazard`, in order."""
 _LABELS = {"draw": None, "axis": _DIMS[-4:], "move": MOVE_NAMES, "next_move": NEXT_NAMES}
 """Labels of its axes, in order; None for numbers."""
-_WEIGHT_ROUNDING = 1e-6
-"""Tolerance for rounding errors in the sum of the weights of components."""
-_BAND = (0.05, 0.95)
-"""Quantile levels of the ends of `p_arrive_band`."""
 _ENTRIES = 1 << 20
 """Maximum size of an array (draw, bound)."""
 _SOME = 256
 """Approximate number of bounds whose mean failure probability determines the order of the draws."""
 
 
-class BoundRisk(Summary):
+class BoundRisk(Risk):
     """Posterior of the probability that each bound of a workspace ends the mission.
 
     Maps have shape (move, row, col, next_move), where (row, col) is the cell that a bound enters.
@@ -126,7 +119,7 @@ class BoundRisk(Summary):
             ("bounds", f"{int(is_bound.sum())}, of which {n_driven} were driven"),
             ("trials", f"{self.trials.sum():.0f}"),
             ("failures", failures),
-            *_rows_of_failures(self.mean),
+            *self._rows_of_failures(),
         ]
 
     @cached_property
@@ -179,17 +172,12 @@ class BoundRisk(Summary):
         return self._maps(mean)
 
     @property
-    def of_bounds(self) -> np.ndarray:
-        """Failure probability of each bound, shape (move, row, col), averaged over next moves."""
-        return over_next_moves(self.mean)
-
-    @property
     def has_failures(self) -> bool:
         """Whether any failure was recorded, at a known or unknown bound."""
         return bool(self.failures.any()) or len(self._lost) > 0
 
     @cached_property
-    def stopped(self) -> np.ndarray:
+    def past_failures(self) -> np.ndarray:
         """Posterior mean of the number of past failures, shape (move, row, col, next_move).
 
         Next moves with the same steepest route share their failures.
@@ -206,13 +194,13 @@ class BoundRisk(Summary):
         return stopped
 
     @cached_property
-    def stopped_with_any_next(self) -> np.ndarray:
+    def past_failures_of_bounds(self) -> np.ndarray:
         """Posterior mean of the number of past failures of each bound, shape (move, row, col)."""
-        bounds = np.argwhere(self.stopped.any(-1))
+        bounds = np.argwhere(self.past_failures.any(-1))
         unit = self._difficulty.of(bounds).unit
         is_first = unit == np.arange(unit.shape[-1])
-        stopped = np.zeros(self.stopped.shape[:-1])
-        stopped[*bounds.T] = np.where(is_first, self.stopped[*bounds.T], 0.0).sum(-1)
+        stopped = np.zeros(self.past_failures.shape[:-1])
+        stopped[*bounds.T] = np.where(is_first, self.past_failures[*bounds.T], 0.0).sum(-1)
         return stopped
 
     def _same_unit(self, bounds: np.ndarray) -> np.ndarray:
@@ -270,14 +258,7 @@ class BoundRisk(Summary):
         """Components with which paths are searched."""
         return self.components()
 
-    def failure(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Compute the failure probability of a path, for `failure_cost` and `max_failure`.
-
-        It is averaged over the components, as in a search; see `along` for the exact mean.
-        """
-        return failure_in(self.searched, path)
-
-    def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
+    def along(self, path: Sequence[Cell] | np.ndarray) -> PathRisk:
         """Compute the risk along a path, without the risk of other bounds.
 
         Given the hyperparameters, units fail independently, with probabilities that have Beta
@@ -301,7 +282,7 @@ class BoundRisk(Summary):
             n_passed[unit] += 1.0
 
         drawn = np.random.default_rng(0).beta(a, b)[:, index]
-        low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
+        low, high = np.quantile(np.prod(1.0 - drawn, axis=1), BAND).tolist()
         return PathRisk(p_fail, float(arrives.mean()), (low, high))
 
     @cached_property
@@ -351,15 +332,6 @@ class BoundRisk(Summary):
         return a, b
 
 
-def _rows_of_failures(p_fail: np.ndarray) -> Rows:
-    """Summarise failure probabilities (move, row, col, next_move)."""
-    p = p_fail[np.isfinite(p_fail)]
-    if not p.size:
-        return [("failure probability", "no bound can be driven")]
-    middle, high = np.quantile(p, (0.5, 0.95))
-    return [("failure probability", f"median {middle:.3g}, 95 % quantile {high:.3g} over bounds")]
-
-
 def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
     """Update a and b (point, bound) with a mission that failed at index `place` (point,) of `path`.
 
@@ -370,161 +342,3 @@ def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) 
         if e >= 0:
             a[:, e] += place == k
             b[:, e] += place > k
-
-
-def over_next_moves(p_fail: np.ndarray) -> np.ndarray:
-    """Average failure probabilities (move, row, col, next_move) over the next moves that exist."""
-    known = np.isfinite(p_fail)
-    total = np.where(known, p_fail, 0.0).sum(-1)
-    return np.where(known.any(-1), total / np.maximum(known.sum(-1), 1), np.nan)
-
-
-def failure_in(components: Components, path: Sequence[Cell] | np.ndarray) -> float:
-    """Compute the failure probability of a path, averaged over components."""
-    p_fail, weights = components
-    index = bounds_and_next(path).T
-    return float(weights @ (1.0 - np.prod(1.0 - p_fail[:, *index], axis=1)))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Risk(Summary):
-    """Given probability that each bound of a workspace ends the mission.
-
-    Attributes:
-        p_fail: Posterior mean, shape (move, row, col, next_move), with moves as in `MOVES`. The
-            last next move is the end of the path. `p_fail` is NaN where there is no bound.
-        draws: Posterior draws, shape (draw, move, row, col, next_move), or None.
-        components: Mean failure probabilities of groups of draws, used for the failure probability
-            of a path. If None, bounds are assumed to fail independently with probability `p_fail`.
-
-    Raises:
-        TrustboError: If the shapes do not match, a probability is outside [0, 1], or the weights of
-            the components do not sum to 1.
-    """
-
-    p_fail: np.ndarray
-    draws: np.ndarray | None = None
-    components: Components | None = None
-
-    def __post_init__(self) -> None:
-        of_components = None if self.components is None else self.components.p_fail
-        more = {"draws": self.draws, "components": of_components}
-        for name, p in {"p_fail": self.p_fail[None], **more}.items():
-            if p is None:
-                continue
-            if p.ndim != 5 or not len(p) or p.shape[1:] != self.p_fail.shape:
-                raise TrustboError(
-                    f"{name} must have shape (..., move, row, col, next_move); got {p.shape}."
-                )
-            bad = (p < 0.0) | (p > 1.0)
-            if bad.any():
-                raise TrustboError(f"{name} must be in [0, 1]; got {p[bad][0]:g}.")
-
-        if self.components is not None:
-            groups, weights = self.components
-            is_share = weights.shape == (len(groups),) and (weights >= 0.0).all()
-            if not is_share or abs(weights.sum() - 1.0) > _WEIGHT_ROUNDING:
-                raise TrustboError(
-                    f"components need {len(groups)} nonnegative weights with the sum 1; got "
-                    f"{one_line(weights)}."
-                )
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of `p_fail`."""
-        return self.p_fail.shape
-
-    def _rows(self) -> Rows:
-        n_draws = 0 if self.draws is None else len(self.draws)
-        together = "independent" if self.components is None else "correlated"
-        return [
-            *_rows_of_failures(self.p_fail),
-            ("draws", str(n_draws)),
-            ("failures of bounds", together),
-        ]
-
-    @property
-    def of_bounds(self) -> np.ndarray:
-        """Failure probability of each bound, shape (move, row, col), averaged over next moves."""
-        return over_next_moves(self.p_fail)
-
-    @property
-    def searched(self) -> Components:
-        """Components with which paths are searched; by default, bounds fail independently."""
-        return self.components or Components(self.p_fail[None], np.ones(1))
-
-    def failure(self, path: Sequence[Cell] | np.ndarray) -> float:
-        """Compute the failure probability of a path, for `failure_cost` and `max_failure`.
-
-        The failure probability is averaged over the components, because failures of bounds are
-        correlated.
-        """
-        return failure_in(self.searched, path)
-
-    def along(self, path: Sequence[Cell] | np.ndarray) -> "PathRisk":
-        """Compute the risk along a path.
-
-        Without draws, the arrival probability is the product of the means 1 - p_fail. With draws,
-        this product is multiplied by the ratio of the mean of the product to the product of the
-        means, both over the draws, because failures are correlated.
-        """
-        index = tuple(bounds_and_next(path).T)
-        p = self.p_fail[index]
-        reach = np.cumprod(1.0 - p)
-        if self.draws is None:
-            return PathRisk(p, float(reach[-1]), (np.nan, np.nan))
-
-        drawn = self.draws[:, *index]
-        low, high = np.quantile(np.prod(1.0 - drawn, axis=1), _BAND).tolist()
-
-        # Passing all bounds is more probable than if bounds were independent. The sampling errors
-        # of the mean p_fail nearly cancel in the ratio of the two probabilities.
-        together = np.cumprod(1.0 - drawn, axis=1).mean(0)
-        apart = np.cumprod((1.0 - drawn).mean(0))
-        ratio = np.divide(together, apart, out=np.ones_like(apart), where=apart > 0.0)
-
-        reach = np.minimum.accumulate(np.minimum(reach * ratio, 1.0 - p))
-        return PathRisk(p, float(reach[-1]), (low, high))
-
-
-def read_risk(what: str, values: ArrayLike, leading: Sequence[str] = ()) -> np.ndarray:
-    """Read probabilities of bounds with their next moves, (..., move, row, col, next_move).
-
-    Args:
-        what: Name of the argument in messages.
-        values: Array of this shape; or without the axis of next moves, which then do not matter. A
-            DataArray is read by its dims and labels.
-        leading: Names of the leading axes.
-
-    Raises:
-        TrustboError: If the dims or labels are wrong.
-    """
-    dims = *leading, "move", "row", "col"
-    labels = {"move": MOVE_NAMES, "next_move": NEXT_NAMES}
-    n_dims = len(values.dims) if isinstance(values, xr.DataArray) else np.ndim(values)
-    if n_dims > len(dims):
-        return read_labelled(what, values, (*dims, "next_move"), labels).values
-
-    maps = read_labelled(what, values, dims, labels).values
-    return np.broadcast_to(maps[..., None], (*maps.shape, len(NEXT_NAMES)))
-
-
-class PathRisk(NamedTuple):
-    """Failure probabilities of the bounds of a path, and the arrival probability."""
-
-    p_fail: np.ndarray
-    """Posterior mean probability that each bound, once begun, ends the mission, shape (bound,)."""
-    p_arrive: float
-    """Probability of reaching the goal."""
-    p_arrive_band: tuple[float, float]
-    """Ends of the 90 % band of `p_arrive` over the draws; NaN without draws."""
-
-    def to_record(self) -> dict[str, Any]:
-        """Convert the risk to plain lists and numbers."""
-        return {**self._asdict(), "p_fail": self.p_fail.tolist()}
-
-    @classmethod
-    def from_record(cls, record: Mapping[str, Any]) -> Self:
-        """Restore the risk from a record made by `to_record`."""
-        low, high = record["p_arrive_band"]
-        return cls(np.array(record["p_fail"]), record["p_arrive"], (low, high))

@@ -110,3 +110,10 @@ def choose_draws(params: Draws, n_draws: int | None, seed: int) -> Draws:
 
     chosen = np.sort(np.random.default_rng(seed).choice(n, n_draws, replace=False))
     return flat.draw(chosen)
+
+
+def drawn_paths(problem: Problem, draws: Draws) -> DrawnPaths:
+    """Find the best path for each draw."""
+    recursion = problem.recursion(draws)
+    _, _, paths = problem.best(recursion)
+    return DrawnPaths(problem, recursion, paths)

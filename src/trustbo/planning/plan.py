@@ -10,7 +10,7 @@ import numpy as np
 
 from trustbo.data import Cell, path_text
 from trustbo.display import Rows, Summary, joined
-from trustbo.hazard.risk import PathRisk
+from trustbo.hazard.path_risk import PathRisk
 from trustbo.workspace import Workspace
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)

@@ -21,24 +21,24 @@ from trustbo.errors import (
     require_whole,
 )
 from trustbo.hazard.components import Components
-from trustbo.hazard.risk import BoundRisk, Risk, read_risk
+from trustbo.hazard.given import GivenRisk, read_risk
+from trustbo.hazard.risk import BoundRisk
 from trustbo.kernels import stopwatch
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
-from trustbo.models.params import ParameterDraws
 from trustbo.parallel import computing
-from trustbo.planning.draws import DrawnPaths, choose_draws
-from trustbo.planning.objectives import LOST_CONTACT, OBJECTIVES, capped
-from trustbo.planning.paths import STEPS, AdmissiblePaths
+from trustbo.planning.draws import DrawnPaths, choose_draws, drawn_paths
+from trustbo.planning.graph import graph_of
+from trustbo.planning.maps import maps_of
+from trustbo.planning.objectives import OBJECTIVES, capped
+from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import (
     EXACT,
-    InfeasibleError,
     Problem,
     draws_of,
     mean_and_draws_of,
     mean_of,
-    risk_of,
     robot_draws_of,
 )
 from trustbo.planning.recursion import Recursion, states_along, trust_recursion
@@ -197,7 +197,7 @@ class Planner(Summary):
             rest = AdmissiblePaths(paths.workspace, cell, self.goal, "shortest", blocked=closed)
             max_bounds = max(max_bounds - n_driven, rest.shortest)
         rest = AdmissiblePaths(paths.workspace, cell, self.goal, max_bounds, blocked=closed)
-        return self._with(paths=rest, x0=self.problem.start(x0))
+        return self._with(paths=rest, x0=self.problem.initial_trust(x0))
 
     def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
         """Check that a path leads from start to goal and return it as a tuple of cells."""
@@ -249,7 +249,7 @@ class Planner(Summary):
         if components is not None:
             groups = read_risk("components", components.p_fail, ("component",))
             components = components._replace(p_fail=groups)
-        return self._with(risk=Risk(mean, drawn, components))
+        return self._with(risk=GivenRisk(mean, drawn, components))
 
     def with_failure_cost(self, failure_cost: float) -> Self:
         """Return a planner with another failure cost, in bounds.
@@ -320,9 +320,7 @@ class Planner(Summary):
         """
         self.problem.require_family(posterior)
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
-        recursion = self.problem.recursion(params)
-        _, _, paths = self.problem.best(recursion)
-        return DrawnPaths(self.problem, recursion, paths)
+        return drawn_paths(self.problem, params)
 
     @computing()
     def evaluate(
@@ -429,46 +427,8 @@ class Planner(Summary):
         Raises:
             TrustboError: If abs(beta0) >= 1, because trust would then grow without limit.
         """
-        problem = self.problem
-        problem.require_family(params, uses_rates=True)
-        recursion = problem.recursion(mean_of(params, self.workspace))
-        radius = np.abs(np.linalg.eigvals(recursion.transition)).max()
-        if radius >= 1.0:
-            raise TrustboError(
-                f"the graph needs abs(beta0) < 1, because trust must converge; got {radius:g}. "
-                "Give other parameters, or use `plan` to find a path."
-            )
-
-        contact = capped(LOST_CONTACT, problem.likelihood, recursion)
-        grid = self.workspace.grid
-        bounds = problem.paths.bounds
-        length = np.hypot(*(STEPS * (grid.cell_height, grid.cell_width)).T)  # (move,)
-
-        def of_bounds(values: np.ndarray) -> np.ndarray:
-            return np.broadcast_to(values, bounds.shape)[bounds]
-
-        trust = of_bounds(recursion.steady_state())
-        rate = problem.likelihood.mean_rate(of_bounds(contact.steady_state()), recursion.noise_sd)
-        lost = of_bounds(problem.bound_cost) + np.maximum(1.0 - rate, 0.0)  # without rounding
-        cost, constant = problem.costs_of_bounds(trust, lost)
-        values = {
-            "length": of_bounds(length[:, None, None]),
-            "drift": of_bounds(recursion.drift.mean(0)),
-            "trust": trust,
-            "lost": lost,
-            "cost": cost,
-        }
-        if problem.risk is not None:
-            values["risk"] = of_bounds(risk_of(problem.risk.of_bounds))
-
-        graph = nx.DiGraph(constant=constant)
-        for row, col in np.argwhere(self.workspace.passable.values).tolist():
-            graph.add_node((row, col), x=float(grid.x[col]), y=float(grid.y[row]))
-        for k, (move, row, col) in enumerate(np.argwhere(bounds).tolist()):
-            origin = row - int(STEPS[move, 0]), col - int(STEPS[move, 1])
-            graph.add_edge(origin, (row, col), **{name: float(v[k]) for name, v in values.items()})
-
-        return graph
+        self.problem.require_family(params, uses_rates=True)
+        return graph_of(self.problem, mean_of(params, self.workspace))
 
     @computing()
     def trust(
@@ -583,37 +543,7 @@ class Planner(Summary):
             attribute `start` of the maps of trust and cost is the start, where trust is assumed.
         """
         params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
-        trust = trust_map(self.problem, params)
-        passable = self.workspace.passable
-        try:
-            share = self.plan_draws(params, n_draws=n_draws).share()
-        except InfeasibleError as error:
-            share = np.zeros(passable.shape)
-            share[tuple(np.array(error.path).T)] = 1.0
-
-        maps = {
-            "trust_mean": (trust.mean("draw"), "mean expected trust"),
-            "trust_sd": (trust.std("draw", skipna=False), "sd of expected trust"),
-            "cost": (cost_of(trust).mean("draw"), "mean cost 1 - sigma(trust)"),
-            "path_probability": (passable.copy(data=share), "P(cell on the best path)"),
-        }
-        effects = params.places if isinstance(params, ParameterDraws) else {}
-        if "place" in effects:
-            place = xr.DataArray(effects["place"].mean(1), dims=("draw", "row", "col"))
-            maps["place_mean"] = place.mean("draw"), "mean place effect"
-            maps["place_sd"] = place.std("draw"), "sd of the place effect"
-
-        awareness = self.workspace.awareness
-        taken = {*maps, "x", "y", "row", "col", "spatial_ref"}
-        for name in self.workspace.features:
-            mean = awareness.sel(feature=name, drop=True).mean(("robot", "move"))
-            label = f"awareness_{name}" if name in taken else name
-            maps[label] = mean, f"{name}, 0 worst, 1 best"
-
-        dataset = xr.Dataset({name: v.assign_attrs(long_name=t) for name, (v, t) in maps.items()})
-        for name in ("trust_mean", "trust_sd", "cost"):
-            dataset[name].attrs["start"] = trust.attrs["start"]
-        return self.workspace.grid.place(dataset.where(passable))
+        return maps_of(self.problem, params)
 
 
 def _bound_cost_of(bound_cost: ArrayLike, bounds: np.ndarray) -> np.ndarray:
@@ -647,7 +577,7 @@ def _value_along(
 
     The values do not include the expected cost of failure.
     """
-    x0 = problem.start(x0)
+    x0 = problem.initial_trust(x0)
     z = along(problem.paths.workspace.awareness.values, cells)
     bounds = bounds_along(cells)
 

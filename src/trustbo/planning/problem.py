@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_positive
-from trustbo.hazard.risk import ROUNDING, BoundRisk, Risk
+from trustbo.hazard.path_risk import ROUNDING, Risk
 from trustbo.inference.learner import expected_and_drawn, params_of
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES, Family
@@ -80,7 +80,7 @@ class Problem:
     bound_cost: np.ndarray
     max_failure: float | None = None
     failure_cost: float | None = None
-    risk: BoundRisk | Risk | None = None
+    risk: Risk | None = None
     x0: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -204,9 +204,9 @@ class Problem:
     ) -> Recursion:
         """Build the recursion for expected trust (see `trust_recursion`)."""
         z = self.paths.workspace.awareness.values
-        return trust_recursion(params, z, self.start(x0), by_robot=by_robot)
+        return trust_recursion(params, z, self.initial_trust(x0), by_robot=by_robot)
 
-    def start(self, x0: ArrayLike | None) -> np.ndarray | None:
+    def initial_trust(self, x0: ArrayLike | None) -> np.ndarray | None:
         """Read expected trust at the start, shape () or (..., robot), by the robots' names."""
         if x0 is None:
             return self.x0
@@ -221,8 +221,8 @@ class Problem:
         return start
 
     @cached_property
-    def risks(self) -> "Risks | None":
-        """Risks of the bounds in the form of the search; None if plans do not depend on risk.
+    def edge_risks(self) -> "EdgeRisks | None":
+        """EdgeRisks of the bounds in the form of the search; None if plans do not depend on risk.
 
         Raises:
             TrustboError: If `max_failure` is set without a risk, or `p_fail` of a bound is NaN.
@@ -247,7 +247,7 @@ class Problem:
 
         limit = np.inf if self.max_failure is None else self.max_failure + ROUNDING
         risks = self.paths.paired.of_edges(risks_by_bound(p_fail))
-        return Risks(risks, self.cost_of_failure, weights, limit)
+        return EdgeRisks(risks, self.cost_of_failure, weights, limit)
 
     def best(self, recursion: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the best admissible path for each draw of the recursion, or for a single draw.
@@ -264,14 +264,14 @@ class Problem:
         self._require_valid(recursion, history)
         recursion = capped(self.objective, self.likelihood, recursion).flat()
 
-        graph = self.paths.graph if self.risks is None else self.paths.paired.graph
+        graph = self.paths.graph if self.edge_risks is None else self.paths.paired.graph
         n_draws, n_states = recursion.start.shape
         drift = recursion.drift.reshape(n_draws, n_states, -1)
         bound_cost = self.bound_cost.ravel()
         state_weights = np.full(n_states, 1.0 / n_states)
         weights = weights_of(self.objective, recursion, state_weights, graph.longest)
 
-        if self.risks is None and not history:
+        if self.edge_risks is None and not history:
             score, paths = best_sums(graph, drift, weights, bound_cost)
             return score, score, paths
 
@@ -282,7 +282,9 @@ class Problem:
             loss = LOSSES[self.likelihood.expected_rate]
             weights = Weights(0.0 * weights.per_bound, 0.0 * weights.constant, weights.scale)
 
-        risks = self.risks or Risks(np.zeros((len(graph.head), 1)), 0.0, np.zeros(1), np.inf)
+        risks = self.edge_risks or EdgeRisks(
+            np.zeros((len(graph.head), 1)), 0.0, np.zeros(1), np.inf
+        )
         costs = Costs(
             loss=loss,
             drift=drift,
@@ -310,7 +312,7 @@ class Problem:
         """
         paired = self.paths.paired
         graph = paired.graph
-        p_fail, weights = cast("BoundRisk | Risk", self.risk).searched
+        p_fail, weights = cast("Risk", self.risk).searched
         n_bounds = self.bound_cost.size
         n = graph.longest + 1
 
@@ -363,8 +365,8 @@ class Problem:
         )
 
 
-class Risks(NamedTuple):
-    """Risks -log(1 - p_fail) of the bounds, which the search sums along a path.
+class EdgeRisks(NamedTuple):
+    """EdgeRisks -log(1 - p_fail) of the bounds, which the search sums along a path.
 
     `of_edges` (edge, component) contains the risks of the bounds that each edge of `paths.paired`
     completes, with one column per component of the risk. If the risks of a path add up to r_m in

@@ -18,7 +18,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.data import Cell
-from trustbo.hazard.risk import BoundRisk, Risk
+from trustbo.hazard.path_risk import Risk
 from trustbo.models.draws import Draws
 from trustbo.planning.objectives import capped, has_history
 from trustbo.planning.paths import AdmissiblePaths
@@ -55,7 +55,7 @@ def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None 
     mean, draws = mean_and_draws_of(params, planner.workspace)
     recursion = capped(problem.objective, problem.likelihood, problem.recursion(mean, x0))
 
-    if problem.risks is not None or has_history(problem.objective, problem.likelihood):
+    if problem.edge_risks is not None or has_history(problem.objective, problem.likelihood):
         paths = every_path(problem.paths)
     else:
         paths = shortest_paths(planner, recursion)
@@ -70,9 +70,7 @@ def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None 
             best = path
             best_value = value
     if best is None:
-        raise _infeasible(
-            problem, cast("BoundRisk | Risk", problem.risk)
-        )  # without a risk, no path is refused
+        raise _infeasible(problem, cast("Risk", problem.risk))  # without a risk, no path is refused
 
     found = planner.evaluate(best, mean, x0=x0)
     if draws is not None:
@@ -140,7 +138,7 @@ def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Cell]) -> f
     return float(value) - problem.failure_along(path)
 
 
-def _infeasible(problem: Problem, risk: BoundRisk | Risk) -> InfeasibleError:
+def _infeasible(problem: Problem, risk: Risk) -> InfeasibleError:
     """Return an error with the safest path, because no path respects `max_failure`."""
     safest = min(every_path(problem.paths), key=risk.failure)
     p_fail = risk.failure(safest)

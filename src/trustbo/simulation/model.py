@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
-from trustbo.hazard.risk import read_risk
+from trustbo.hazard.given import read_risk
 from trustbo.models import PooledTrust
 from trustbo.models.draws import Draws
 from trustbo.models.model import TrustModel

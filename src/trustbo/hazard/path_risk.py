@@ -1,0 +1,93 @@
+"""Risk of a path, and what all risks of the bounds of a workspace have in common."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from trustbo.data import Cell
+from trustbo.display import Rows, Summary
+from trustbo.hazard.components import Components
+from trustbo.workspace.moves import bounds_and_next
+
+ROUNDING = 1e-12
+"""Tolerance for rounding errors when the risk of a path is compared with its limit."""
+BAND = (0.05, 0.95)
+"""Quantile levels of the ends of `p_arrive_band`."""
+
+
+class PathRisk(NamedTuple):
+    """Failure probabilities of the bounds of a path, and the arrival probability."""
+
+    p_fail: np.ndarray
+    """Posterior mean probability that each bound, once begun, ends the mission, shape (bound,)."""
+    p_arrive: float
+    """Probability of reaching the goal."""
+    p_arrive_band: tuple[float, float]
+    """Ends of the 90 % band of `p_arrive` over the draws; NaN without draws."""
+
+    def to_record(self) -> dict[str, Any]:
+        """Convert the risk to plain lists and numbers."""
+        return {**self._asdict(), "p_fail": self.p_fail.tolist()}
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Self:
+        """Restore the risk from a record made by `to_record`."""
+        low, high = record["p_arrive_band"]
+        return cls(np.array(record["p_fail"]), record["p_arrive"], (low, high))
+
+
+class Risk(Summary, ABC):
+    """Probability that each bound of a workspace ends the mission.
+
+    Maps have shape (move, row, col, next_move), where (row, col) is the cell that a bound enters.
+    Moves are ordered as in `MOVES`, and the last next move is the end of the path. Failure
+    probabilities are NaN where there is no bound.
+    """
+
+    @cached_property
+    @abstractmethod
+    def mean(self) -> np.ndarray:
+        """Mean of the failure probability, shape (move, row, col, next_move)."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the maps."""
+
+    @cached_property
+    @abstractmethod
+    def searched(self) -> Components:
+        """Components with which paths are searched."""
+
+    @abstractmethod
+    def along(self, path: Sequence[Cell] | np.ndarray) -> PathRisk:
+        """Compute the risk along a path."""
+
+    @property
+    def of_bounds(self) -> np.ndarray:
+        """Failure probability of each bound, shape (move, row, col), averaged over next moves."""
+        known = np.isfinite(self.mean)
+        total = np.where(known, self.mean, 0.0).sum(-1)
+        return np.where(known.any(-1), total / np.maximum(known.sum(-1), 1), np.nan)
+
+    def failure(self, path: Sequence[Cell] | np.ndarray) -> float:
+        """Compute the failure probability of a path, for `failure_cost` and `max_failure`.
+
+        It is averaged over the components, as in a search, because failures of bounds are
+        correlated; see `along` for the exact mean.
+        """
+        p_fail, weights = self.searched
+        index = bounds_and_next(path).T
+        return float(weights @ (1.0 - np.prod(1.0 - p_fail[:, *index], axis=1)))
+
+    def _rows_of_failures(self) -> Rows:
+        """Summarise the failure probabilities."""
+        p = self.mean[np.isfinite(self.mean)]
+        if not p.size:
+            return [("failure probability", "no bound can be driven")]
+        middle, high = np.quantile(p, (0.5, 0.95))
+        spread = f"median {middle:.3g}, 95 % quantile {high:.3g} over bounds"
+        return [("failure probability", spread)]
