@@ -28,11 +28,12 @@ from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
 from trustbo.parallel import computing
 from trustbo.planning.draws import DrawnPaths, choose_draws, drawn_paths
+from trustbo.planning.evaluation import evaluated
 from trustbo.planning.graph import graph_of
 from trustbo.planning.maps import maps_of
-from trustbo.planning.objectives import OBJECTIVES, capped
+from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.paths import AdmissiblePaths
-from trustbo.planning.plan import QUANTILES, Plan
+from trustbo.planning.plan import Plan
 from trustbo.planning.problem import (
     EXACT,
     Problem,
@@ -41,12 +42,12 @@ from trustbo.planning.problem import (
     mean_of,
     robot_draws_of,
 )
-from trustbo.planning.recursion import Recursion, states_along, trust_recursion
+from trustbo.planning.recursion import Recursion
 from trustbo.planning.robot_trust import robot_maps, robot_trust
 from trustbo.planning.trust_map import cost_of, trust_map
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import MOVE_NAMES, along, bounds_along, require_on_grid
+from trustbo.workspace.moves import MOVE_NAMES, bounds_along, require_on_grid
 
 _DIMS = ("move", "row", "col")
 _MOVE_LABELS = {"move": MOVE_NAMES}
@@ -283,7 +284,7 @@ class Planner(Summary):
         with stopwatch() as elapsed:
             mean, draws = mean_and_draws_of(params, self.workspace)
             score, limits, paths = self.problem.best(self.problem.recursion(mean, x0))
-            plan = self._evaluated(self.problem.paths.cells(paths[0]), mean, draws, x0)
+            plan = evaluated(self.problem, self.problem.paths.cells(paths[0]), mean, draws, x0)
             seconds = elapsed()
 
         exact = bool(limits[0] - score[0] <= EXACT)
@@ -342,48 +343,8 @@ class Planner(Summary):
         """
         self.problem.require_family(params)
         path = self.require_path(path)
-        return self._evaluated(path, draws_of(params, self.workspace, next_mission=True), None, x0)
-
-    def _evaluated(
-        self,
-        path: tuple[Cell, ...],
-        given: Draws,
-        draws: Draws | None,
-        x0: ArrayLike | None,
-    ) -> Plan:
-        """Return a plan for a path: trust and value are those of `given`, averaged over its draws.
-
-        The bands are quantiles over `draws` or, if None, over the draws of `given`.
-        """
-        problem = self.problem
-        cells = np.array(path)
-        cost = problem.failure_along(cells)
-
-        trust, value, values = _value_along(problem, cells, given, x0)
-        drawn = trust
-        if draws is not None:
-            drawn, _, values = _value_along(problem, cells, draws, x0)
-
-        bands = np.repeat(drawn, len(QUANTILES), axis=0)
-        value_band = None
-        if len(drawn) > 1:
-            bands = np.quantile(drawn, QUANTILES, axis=0)
-            low, high = np.quantile(values - cost, (QUANTILES[0], QUANTILES[-1])).tolist()
-            value_band = low, high
-
-        return Plan(
-            path=path,
-            trust=trust.mean(0),
-            bands=bands,
-            value=value - cost,
-            objective=problem.objective.name,
-            exact=False,
-            limit=np.nan,
-            seconds=0.0,
-            workspace=self.workspace,
-            risk=None if problem.risk is None else problem.risk.along(cells),
-            infeasible=not problem.is_within_limit(cells),
-            value_band=value_band,
+        return evaluated(
+            self.problem, path, draws_of(params, self.workspace, next_mission=True), None, x0
         )
 
     @computing()
@@ -568,31 +529,3 @@ def _bound_cost_of(bound_cost: ArrayLike, bounds: np.ndarray) -> np.ndarray:
         )
 
     return bound_cost
-
-
-def _value_along(
-    problem: Problem, cells: np.ndarray, params: Draws, x0: ArrayLike | None
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Compute trust (draw, bound, robot), the value of a path, and the value for each draw.
-
-    The values do not include the expected cost of failure.
-    """
-    x0 = problem.initial_trust(x0)
-    z = along(problem.paths.workspace.awareness.values, cells)
-    bounds = bounds_along(cells)
-
-    by_robot = trust_recursion(params, z, x0, bounds=bounds, by_robot=True)
-    trust = states_along(by_robot)
-    trust = trust.reshape(-1, *trust.shape[-2:])
-    bound_cost = problem.bound_cost_along(cells)
-    values = np.atleast_1d(problem.value_along(bound_cost, trust.mean(-1), by_robot.noise_sd))
-    if not problem.objective.of_contact:
-        value = problem.value_along(bound_cost, trust.mean((0, -1)), by_robot.noise_sd)
-        return trust, float(value), values
-
-    # Capping the trust of each draw causes bias, so the value of each draw uses uncapped trust.
-    # However, the contact lost on a path cannot be negative.
-    team = by_robot if params.by_robot else by_robot.of_team()
-    team = capped(problem.objective, problem.likelihood, team)
-    mean = problem.value_along(bound_cost, states_along(team).mean(-1), team.noise_sd).mean()
-    return trust, float(mean), np.minimum(values, -bound_cost)
