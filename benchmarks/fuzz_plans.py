@@ -7,7 +7,7 @@ effects, the model (equal, different or coupled robots), the objective, the fami
 limits on the number of bounds, U-turns, and risks (limits, costs, components). Numbers are usual,
 large, tied or 0. The plan must have the best score of all admissible paths, which
 `peers.every_path` enumerates without code of the planner. With --networkx, the plan must also have
-the value of `planning.reference.plan`. Problem I of a seed is always the same.
+the value of `peers.networkx_planner`. Problem I of a seed is always the same.
 """
 
 import sys
@@ -15,13 +15,14 @@ from collections import Counter
 
 import numpy as np
 from common import arguments, parsed
+from peers import networkx_planner
 from peers.every_path import STEPS, TooManyError, World, best_walk, score_along, to_goal
 from scipy.special import logit
 
 from trustbo.hazard.components import Components
 from trustbo.models import TrustParams
 from trustbo.models.params import CoupledParams, RobotParams
-from trustbo.planning import InfeasibleError, Planner, reference
+from trustbo.planning import InfeasibleError, Planner
 from trustbo.workspace import Workspace
 
 OBJECTIVES, FAMILIES = (
@@ -227,7 +228,7 @@ def main():
         planner, params, world, best = problem_of(given.seed, index, most)
         wrong, exact = faults(planner, params, world, best)
         if given.networkx and not wrong and best > -np.inf:
-            ours, theirs = planner.plan(params), reference.plan(planner, params)
+            ours, theirs = planner.plan(params), networkx_planner.plan(planner, params)
             if abs(ours.value - theirs.value) > 1e-9 * max(1.0, abs(theirs.value)):
                 wrong.append(f"value {ours.value:.12g}, networkx {theirs.value:.12g}")
         outcome.update(

@@ -14,13 +14,14 @@ import time
 import networkx as nx
 import numpy as np
 from common import Table, arguments, parsed
+from peers import networkx_planner
 from scipy.ndimage import gaussian_filter
 from scipy.sparse.csgraph import dijkstra
 
 from trustbo.hazard.components import Components
 from trustbo.inference import sample_prior
 from trustbo.models import PooledTrust, TrustParams
-from trustbo.planning import Planner, reference
+from trustbo.planning import Planner
 from trustbo.workspace import Workspace
 
 PARAMS = TrustParams(0.6, np.array([0.8, 0.6]), -0.2, 0.1, 0.1)
@@ -57,7 +58,7 @@ def many_draws(table, n, few):
         note = ""
         if few:
             started = time.process_time()
-            slow = [reference.plan(planner, draws.draw(d)).value for d in range(few)]
+            slow = [networkx_planner.plan(planner, draws.draw(d)).value for d in range(few)]
             factor = (time.process_time() - started) * 1e6 / few / took
             np.testing.assert_allclose(planner.plan_draws(draws).values[:few], slow, rtol=1e-9)
             note = f"reference on networkx: {factor:.0f} x"

@@ -16,7 +16,7 @@ from trustbo.inference import fit, params_of, sample_prior
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.models import PooledTrust, TrustParams
 from trustbo.models.params import CoupledParams, RobotParams
-from trustbo.planning import OBJECTIVES, Planner, expected_trust, reference
+from trustbo.planning import OBJECTIVES, Planner, expected_trust
 from trustbo.planning.paths import STEPS
 from trustbo.simulation import ModelSimulator
 from trustbo.workspace import Workspace
@@ -223,7 +223,7 @@ def test_costs_of_a_mean_order_the_paths_with_the_same_number_of_bounds(workspac
     planner = Planner(workspace, *ENDS, "mean", bound_cost=0.01, max_bounds="shortest+1")
     graph = planner.graph(forgetful)
     assert min(cost for _, _, cost in graph.edges(data="cost")) >= 0.0
-    for path in reference.every_path(planner.problem.paths):
+    for path in paths_of(planner):
         mean = nx.path_weight(graph, path, "cost") / (len(path) - 1)
         value = planner.evaluate(path, forgetful).value
         assert graph.graph["constant"] - mean == pytest.approx(value, rel=1e-9)
@@ -234,9 +234,7 @@ def test_failures_cost_at_most_what_the_graph_says(workspace):
     p_fail = np.random.default_rng(1).uniform(0.0, 0.2, (8, 5, 6))
     planner = Planner(workspace, *ENDS, failure_cost=2.0).with_risk(p_fail)
     graph = planner.graph(forgetful)
-    for path in reference.every_path(
-        Planner(workspace, *ENDS, max_bounds="shortest").problem.paths
-    ):
+    for path in paths_of(Planner(workspace, *ENDS, max_bounds="shortest")):
         plan = planner.evaluate(path, forgetful)
         lost = nx.path_weight(graph, path, "lost") + 2.0 * (1.0 - plan.p_arrive)
         assert lost == pytest.approx(-plan.value, rel=1e-9)
@@ -355,7 +353,6 @@ def test_logits_of_a_posterior_are_not_read_as_contact_rates():
         planner.robot_maps,
         lambda given: planner.evaluate(path, given),
         lambda given: planner.trust(given, as_rate=True),
-        lambda given: reference.plan(planner, given),
     ):
         with pytest.raises(TrustboError, match="family='beta_binomial'"):
             use(posterior)

@@ -11,13 +11,15 @@ import numpyro.distributions as dist
 import pytest
 from enumeration import paths_of
 from fuzz_plans import draw_problem, faults
+from peers import networkx_planner
 from peers.every_path import TooManyError, best_walk
+from peers.networkx_planner import network_of
 
 from trustbo.errors import TrustboError
 from trustbo.hazard.components import Components
 from trustbo.inference.learner import learner_of
 from trustbo.models import ContactRate, TrustParams
-from trustbo.planning import OBJECTIVES, InfeasibleError, Planner, reference
+from trustbo.planning import OBJECTIVES, InfeasibleError, Planner
 from trustbo.planning.objectives import Objective
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import bounds_along
@@ -65,7 +67,7 @@ def test_networkx_finds_plans_of_the_same_value(seed):
     for planner, params, _, best in random_problems(seed, 50, 500):
         if best == -np.inf:
             with pytest.raises(InfeasibleError) as expected:
-                reference.plan(planner, params)
+                networkx_planner.plan(planner, params)
             with pytest.raises(InfeasibleError) as error:
                 planner.plan(params)
             assert error.value.p_fail == pytest.approx(expected.value.p_fail, rel=1e-9)
@@ -73,7 +75,7 @@ def test_networkx_finds_plans_of_the_same_value(seed):
             continue
 
         x0 = None if planner.workspace.team.n_robots < 3 else [0.9, -0.3, 0.2]
-        expected = reference.plan(planner, params, x0=x0)
+        expected = networkx_planner.plan(planner, params, x0=x0)
         plan = planner.plan(params, x0=x0)
         assert plan.value == pytest.approx(expected.value, rel=1e-9, abs=1e-9)
         assert expected.exact
@@ -113,7 +115,7 @@ def test_networkx_finds_plans_of_functions(workspace, options, by_robot):
     planner = Planner(workspace, *ENDS, **options)
     if "max_failure" in options:
         planner = planner.with_risk(np.random.default_rng(0).uniform(0.0, 0.1, (8, 4, 4)))
-    expected, plan = reference.plan(planner, draws), planner.plan(draws)
+    expected, plan = networkx_planner.plan(planner, draws), planner.plan(draws)
     assert plan.exact
     assert plan.value == pytest.approx(expected.value, rel=1e-9)
     assert plan.value_band == pytest.approx(expected.value_band, rel=1e-9)
@@ -124,7 +126,7 @@ def test_networkx_finds_plans_of_functions(workspace, options, by_robot):
 def test_the_unrolled_graph_has_every_admissible_path(workspace, max_bounds):
     planner = Planner(workspace, *ENDS, max_bounds=max_bounds)
     paths = planner.problem.paths
-    graph = paths.graph.to_networkx(np.zeros(len(paths.graph.head)))
+    graph = network_of(paths.graph, np.zeros(len(paths.graph.head)))
     assert nx.is_directed_acyclic_graph(graph)
     found = set()
     for s in paths.graph.starts.tolist():

@@ -1,6 +1,6 @@
 """Search for the most trustworthy path, given a posterior of the trust model."""
 
-from trustbo.planning import policies, reference
+from trustbo.planning import policies
 from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.paths import NoPathError
 from trustbo.planning.plan import Plan
@@ -18,6 +18,5 @@ __all__ = [
     "Planner",
     "expected_trust",
     "policies",
-    "reference",
 ]  # fmt: skip
 __dir__ = __all__.copy  # tab completion lists only public names

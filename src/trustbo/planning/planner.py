@@ -375,9 +375,8 @@ class Planner(Summary):
         For the first two objectives, `nx.shortest_path(graph, start, goal, weight="cost")` then has
         the value of the plan, unless it has more than `max_bounds` bounds or the planner has a
         risk. If beta0 is not 0, this path is a heuristic, because trust after a bound depends on
-        the bounds before it. In these cases, `planning.reference` finds the best path with networkx
-        on the unrolled graph or by enumeration. For your own objectives, the costs are those of
-        `terminal` if trust counts only at the goal, and those of `mean` otherwise.
+        the bounds before it. For your own objectives, the costs are those of `terminal` if trust
+        counts only at the goal, and those of `mean` otherwise.
 
         Costs are at least 0, as Dijkstra's algorithm requires, unless a bound cost is negative. In
         that case, use `nx.bellman_ford_path`, provided that no loop has a negative cost.

@@ -3,13 +3,11 @@
 A state (cell, n_bounds_left) is a cell from which exactly `n_bounds_left` bounds remain. Each edge
 is a bound, and leads to a state with one bound fewer left. Paths through the graph are the
 admissible paths, except that U-turns must be excluded if they are forbidden. Compiled kernels
-process the states in order of `n_bounds_left`, and `to_networkx` exports the same edges.
+process the states in order of `n_bounds_left`.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
-import networkx as nx
 import numpy as np
 
 from trustbo import kernels
@@ -44,39 +42,6 @@ class Unrolled(NamedTuple):
     def longest(self) -> int:
         """Largest number of bounds of a path."""
         return int(self.n_bounds_left[-1])
-
-    def to_networkx(self, cost: Sequence[float] | np.ndarray) -> nx.DiGraph:
-        """Return a networkx graph with the `cost` and the `bound` of each edge.
-
-        Every path from a node `(None, start, n_bounds_left)` to the node `"goal"` is admissible.
-        Each other node is a tuple (previous cell, cell, bounds left). If U-turns are allowed, the
-        previous cell is not needed and is None.
-
-        Args:
-            cost: Cost of each edge, shape (edge,).
-        """
-        graph = nx.DiGraph()
-        nodes: list[tuple[int | None, int]] = [(None, s) for s in self.starts.tolist()]
-        met = set(nodes)
-
-        while nodes:
-            before, s = nodes.pop()
-            tail = (before, int(self.cell[s]), int(self.n_bounds_left[s]))
-            for e in range(self.first[s], self.first[s + 1]):
-                h = int(self.head[e])
-                if not self.turns and self.cell[h] == before:
-                    continue
-
-                onward = (None if self.turns else tail[1], h)
-                head = "goal"
-                if h != 0:
-                    head = onward[0], int(self.cell[h]), int(self.n_bounds_left[h])
-                graph.add_edge(tail, head, cost=float(cost[e]), bound=int(self.bound[e]))
-                if h > 0 and onward not in met:
-                    met.add(onward)
-                    nodes.append(onward)
-
-        return graph
 
 
 class Paired(NamedTuple):

@@ -1,4 +1,4 @@
-"""Reference planner, based on networkx and enumeration, for testing the compiled searches.
+"""Reference planner, based on networkx and enumeration, with which plans are compared.
 
 The reference planner covers everything that `Planner.plan` does: all objectives, families, models,
 costs, risks and limits. If the score of a path is a sum over its bounds, the Bellman-Ford algorithm
@@ -26,9 +26,8 @@ from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.problem import InfeasibleError, Problem, mean_and_draws_of
 from trustbo.planning.recursion import Recursion, states_along
+from trustbo.planning.unrolled import Unrolled
 from trustbo.workspace.moves import cells_ahead
-
-__all__ = ["plan"]
 
 
 def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None = None) -> Plan:
@@ -44,10 +43,6 @@ def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None 
 
     Raises:
         InfeasibleError: If no path respects `max_failure`.
-
-    Example:
-        >>> planner = tb.planning.Planner(workspace, (3, 0), (0, 3), family="censored")
-        >>> tb.planning.reference.plan(planner, posterior).value  # that of planner.plan(posterior)
     """
     started = time.perf_counter()
     problem = planner.problem
@@ -117,7 +112,7 @@ def cheapest_paths(
         cost: Cost of each edge of the unrolled graph `paths.graph`, shape (edge,).
     """
     graph = paths.graph
-    network = graph.to_networkx(cost)
+    network = network_of(graph, cost)
 
     for s in graph.starts:
         start = None, int(graph.cell[s]), int(graph.n_bounds_left[s])
@@ -128,6 +123,41 @@ def cheapest_paths(
 
         cells = np.array([node[1] for node in nodes[:-1]])
         yield (*paths.cells(cells), paths.goal)
+
+
+def network_of(graph: Unrolled, cost: Sequence[float] | np.ndarray) -> nx.DiGraph:
+    """Convert an unrolled graph to networkx, with the `cost` and the `bound` of each edge.
+
+    Every path from a node `(None, start, n_bounds_left)` to the node `"goal"` is admissible. Each
+    other node is a tuple (previous cell, cell, bounds left). If U-turns are allowed, the previous
+    cell is not needed and is None.
+
+    Args:
+        graph: Unrolled graph, such as `paths.graph`.
+        cost: Cost of each edge, shape (edge,).
+    """
+    network = nx.DiGraph()
+    nodes: list[tuple[int | None, int]] = [(None, s) for s in graph.starts.tolist()]
+    met = set(nodes)
+
+    while nodes:
+        before, s = nodes.pop()
+        tail = (before, int(graph.cell[s]), int(graph.n_bounds_left[s]))
+        for e in range(graph.first[s], graph.first[s + 1]):
+            h = int(graph.head[e])
+            if not graph.turns and graph.cell[h] == before:
+                continue
+
+            onward = (None if graph.turns else tail[1], h)
+            head = "goal"
+            if h != 0:
+                head = onward[0], int(graph.cell[h]), int(graph.n_bounds_left[h])
+            network.add_edge(tail, head, cost=float(cost[e]), bound=int(graph.bound[e]))
+            if h > 0 and onward not in met:
+                met.add(onward)
+                nodes.append(onward)
+
+    return network
 
 
 def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Cell]) -> float:
