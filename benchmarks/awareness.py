@@ -25,13 +25,12 @@ import numpy as np
 import pandas as pd
 from common import arguments, parsed
 from scipy import stats
+from world_set import COURSES, World, worlds
 
 import trustbo as tb
 from trustbo.data import Cell
 from trustbo.models import TrustParams, default_model
 from trustbo.planning.policies import random
-from trustbo.study import worlds
-from trustbo.study.world import COURSES, World
 
 N_MISSIONS = 8
 PAPER = "paper's terrain"

@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
+from world_set import World, worlds
 
 import trustbo as tb
-from trustbo.study import worlds
-from trustbo.study.world import World
 
 PAIRS = {
     "synthetic-0": "synthetic-1",

@@ -29,14 +29,13 @@ from pathlib import Path
 
 import numpy as np
 from common import Table, arguments, parsed
+from world_set import COURSES, World, worlds
 
 import trustbo as tb
 from trustbo.hazard import Hazard
 from trustbo.hazard.given import GivenRisk
 from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.replicates import replicated
-from trustbo.study import worlds
-from trustbo.study.world import COURSES, World
 from trustbo.workspace.difficulty import MEASURES
 from trustbo.workspace.moves import END, MOVES, bounds_and_next
 

@@ -20,12 +20,11 @@ from typing import Any
 import numpy as np
 import numpyro.distributions as dist
 from common import Table, arguments, parsed
+from world_set import COURSES, worlds
 from worlds import SET, SET_COURSES
 
 import trustbo as tb
 from trustbo.models import PlaceEffect, PooledTrust, Priors, RobotEffect
-from trustbo.study import worlds
-from trustbo.study.world import COURSES
 
 MAX_BOUNDS = "shortest+4"
 MISSIONS = 15

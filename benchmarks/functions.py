@@ -32,6 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+import summary
 from common import Table, arguments, parsed
 from groups import holm
 from jax.flatten_util import ravel_pytree
@@ -40,6 +41,7 @@ from numpyro.infer.util import initialize_model
 from own_functions import FUNCTIONS
 from own_functions import as_default as default_as_function
 from scipy import stats
+from world_set import worlds
 
 import trustbo as tb
 from trustbo.inference.diagnostics import complaints_of
@@ -48,7 +50,7 @@ from trustbo.inference.functions.draws import FunctionDraws
 from trustbo.inference.functions.function import as_model
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.observations import Observations
-from trustbo.study import numbers_of, run_grid, worlds
+from trustbo.study import run_grid
 
 FEATURES = ("traversability", "line_of_sight")
 START, GOAL = (7, 0), (0, 7)
@@ -195,9 +197,9 @@ def as_default(out):
     started = time.process_time()
     runs = run_grid(cases, scenes, out, n_missions=10, n_jobs=1)
     print(f"{time.process_time() - started:.0f} CPU s", flush=True)
-    table = numbers_of(runs)
+    table = summary.numbers_of(runs)
     print(table.pivot(index="scene", columns="case", values="lost while learning").round(4))
-    pairs = tb.study.differences(table, "as a function")
+    pairs = summary.differences(table, "as a function")
     print(pairs[["lost while learning", "seconds"]].round(4).T.to_string(), flush=True)
 
 

@@ -692,17 +692,7 @@ def of_study() -> list[Call]:
         "seeds": (0,),
         "n_missions": 1,
     }
-    judged = {"regret": [3.0, 2.0], "lost": [1.0, 0.8], "best": 0.5, "contact_rate": [np.nan, 0.7]}
-    driven = {"driven": 0.9, "best_driven": 0.5, "failed_driven": 0.9, "seconds": 1.0}
-    runs = {"case": "a", "scene": "s", "seed": 0, "mission": [0, 1], "status": ["", "ok"]}
-    table = pd.DataFrame({**runs, **judged, **driven})
-    return [
-        Call("study.run_grid", partial(tb.study.run_grid, n_jobs=1), run),
-        Call("study.numbers_of", tb.study.numbers_of, {"table": table}),
-        Call(
-            "study.summary", tb.study.summary, {"numbers": tb.study.numbers_of(table), "by": "case"}
-        ),
-    ]
+    return [Call("study.run_grid", partial(tb.study.run_grid, n_jobs=1), run)]
 
 
 CALLS = (

@@ -15,9 +15,8 @@ import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
 from scipy import stats
-
-from trustbo.study import worlds
-from trustbo.study.summary import bootstrap
+from summary import bootstrap
+from world_set import worlds
 
 OURS = "trustbo"
 BASELINES = ("running mean", "residual process", "line of sight")
@@ -48,11 +47,11 @@ NAMES = {
     "lost with failures": LOST, "arrive of the first 3": "arrive_first_3",
     "arrive later": "arrive_later",
 }  # fmt: skip
-"""New column names, keyed by the column names of `study.numbers_of`."""
+"""New column names, keyed by the column names of `numbers_of`."""
 
 
 def rows_of(numbers: pd.DataFrame) -> pd.DataFrame:
-    """Average the results of `study.numbers_of` over seeds, for each method, world and course."""
+    """Average the results of `numbers_of` over seeds, for each method, world and course."""
     rows = numbers.rename(columns=NAMES)
     labels = ["world", "kind", "course", "method"]
     return rows.groupby(labels, as_index=False)[COLUMNS].mean()

@@ -26,13 +26,12 @@ import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
 from groups import grounds_of
+from summary import bootstrap
+from world_set import COURSES, World, drawn, worlds
 
 import trustbo as tb
 from trustbo.campaign.learning import informed_planner
 from trustbo.planning import Planner
-from trustbo.study import worlds
-from trustbo.study.summary import bootstrap
-from trustbo.study.world import COURSES, World, drawn
 
 OBJECTIVES = {"(6)": "terminal", "mean": "mean"}
 """Objective of paths, keyed by its short name."""

@@ -16,10 +16,10 @@ import numpy as np
 import xarray as xr
 from common import Table, arguments, parsed
 from groups import ALIKE
+from world_set import worlds
 
 import trustbo as tb
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
-from trustbo.study import worlds
 from trustbo.workspace.moves import MOVE_NAMES, bounds_along
 
 WORLDS = (

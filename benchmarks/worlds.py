@@ -23,10 +23,11 @@ from baselines import line_of_sight, oracle, residual_process, running_mean, unl
 from common import arguments, parsed
 from groups import KINDS, OURS, interval, report_groups, rows_of
 from joblib import Parallel, delayed
+from summary import differences, numbers_of, summary
+from world_set import COURSES, World, worlds
 
 import trustbo as tb
-from trustbo.study import differences, numbers_of, run_grid, summary, worlds
-from trustbo.study.world import COURSES, World
+from trustbo.study import run_grid
 
 SET = (
     "synthetic-0", "synthetic-1", "synthetic-2", "wellington", "synthetic-0-aged",
@@ -75,7 +76,7 @@ ABOUT = {
     "lost with failures": "lost with failures (bounds per mission; failed bounds count as lost)",
     "missions to 1 %": "missions to 1 % (missions until the regret stays within 1 %)",
 }
-"""Longer descriptions of quantities, keyed by the column names of `study.numbers_of`."""
+"""Longer descriptions of quantities, keyed by the column names of `numbers_of`."""
 OF_DIFFERENCES = ["pairs", "regret after 15", "regret now", "lost while learning",
                   "lost with failures", "missions to 1 %", "seconds"]  # fmt: skip
 

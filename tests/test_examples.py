@@ -48,8 +48,7 @@ SLOW = {
     *("trustbo.Campaign", "trustbo.RegretBound", "trustbo.Result", "trustbo.iterate"),
     *("trustbo.load_result", "trustbo.resume", "trustbo.logs.read_reports"),
     *("trustbo.models.ContactRate", "trustbo.models.HumanTrust", "trustbo.models.PooledTrust"),
-    *("trustbo.inference.predict_reports", "trustbo.study.differences", "trustbo.study.numbers_of"),
-    *("trustbo.study.run_grid", "trustbo.study.summary"),
+    *("trustbo.inference.predict_reports", "trustbo.study.run_grid"),
 }
 """Objects whose examples run campaigns or compile models that no other example needs."""
 NEEDS = {"trustbo.terrain.read_lidar": "laspy", "trustbo.logs.read_bag": "rosbags"}
@@ -127,17 +126,6 @@ class Prepared:
         simulator = tb.simulation.RadioSimulator(self.workspace)
         truth = tb.simulation.Truth.from_simulator(simulator)
         return tb.study.Scene(self.workspace, simulator, START, GOAL, truth=truth)
-
-    @functools.cached_property
-    def table(self):
-        """Table of `run_grid`, with two cases and two missions."""
-        cases = {"default": {}, "random": {"policy": "random"}}
-        scenes = {"hills": self.make_scene}
-        return tb.study.run_grid(cases, scenes, "table", n_missions=2, n_jobs=1)
-
-    @functools.cached_property
-    def numbers(self):
-        return tb.study.numbers_of(self.table)
 
 
 def write_files(text, prepared):

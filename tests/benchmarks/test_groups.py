@@ -28,8 +28,7 @@ from groups import (
     rows_of,
 )
 from scipy import stats
-
-from trustbo.study import worlds
+from world_set import worlds
 
 METHODS = (OURS, "running mean", "residual process", "line of sight")
 LOSES = {OURS: 0.1, "running mean": 0.3, "residual process": 0.2, "line of sight": 0.9}

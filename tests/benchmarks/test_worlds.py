@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-
-from trustbo.study import differences, summary
+from summary import differences, summary
 
 FILE = Path(__file__).resolve().parents[2] / "benchmarks" / "worlds.py"
 

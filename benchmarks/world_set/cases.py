@@ -9,9 +9,9 @@ import numpy as np
 
 from trustbo.files import FilePath
 from trustbo.simulation import Degradation, Dust, Fouling, Jam, Season, Trees
-from trustbo.study.world import REAL, World, drawn
 from trustbo.team import Robot, Team
 from trustbo.workspace.sight import Sight
+from world_set.world import REAL, World, drawn
 
 _SYNTHETIC = tuple(f"synthetic-{seed}" for seed in range(3))
 _ALDER = "synthetic-alder"
@@ -186,11 +186,6 @@ def worlds(data: FilePath | None = None) -> dict[str, World]:
 
     Returns:
         Worlds on 6 synthetic and 4 real terrains.
-
-    Example:
-        >>> worlds = tb.study.worlds()
-        >>> len(worlds)
-        97
     """
     folder = None if data is None else str(data)
     return {world.name: replace(world, data=folder) for world in _all()}

@@ -6,12 +6,11 @@ import itertools
 
 import numpy as np
 import pytest
+from world_set import REAL, drawn, worlds
 
 from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
 from trustbo.simulation.events import Event
 from trustbo.simulation.replicates import table_of
-from trustbo.study import worlds
-from trustbo.study.world import REAL, drawn
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from trustbo.errors import TrustboError, require_choice
 from trustbo.files import FilePath, to_path
 from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
 from trustbo.simulation.events import Event
-from trustbo.study.grid import Scene
+from trustbo.study import Scene
 from trustbo.team import Team
 from trustbo.terrain.examples import EXAMPLE_FILES
 from trustbo.terrain.place import quiet_affine
