@@ -46,7 +46,7 @@ from world_set import worlds
 import trustbo as tb
 from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.functions.data import arrays_of, data_of
-from trustbo.inference.functions.draws import FunctionDraws
+from trustbo.inference.functions.draws import draws_of_drift, function_drift
 from trustbo.inference.functions.function import as_model
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.observations import Observations
@@ -358,8 +358,9 @@ def program(seeds):
         for n, tree in enumerate(run.posteriors, start=1):
             missions = run.missions[:n]
             function, values = as_values(model, tree, missions)
-            draws = FunctionDraws(function, values, missions[0].robots, FEATURES,
-                                  workspace.passable.shape)  # fmt: skip
+            draws = draws_of_drift(function_drift(
+                function, values, missions[0].robots, FEATURES, workspace.passable.shape
+            ))  # fmt: skip
             planner = run.planner
             equal += planner.plan(draws).path == planner.plan(tree).path
             if n == MISSIONS:

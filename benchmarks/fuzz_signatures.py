@@ -680,7 +680,7 @@ def of_plots() -> list[Call]:
 
 
 def three_features() -> tb.models.TrustParams:
-    return PARAMS._replace(beta=np.array([0.3, 0.2, 0.1]))
+    return PARAMS.replace(beta=np.array([0.3, 0.2, 0.1]))
 
 
 def of_study() -> list[Call]:

@@ -132,7 +132,7 @@ def on_a_grid(family, p, z, y, n_points=1201, *, n_ticks=20):
     scale = 1.0 / (p.delta_w * np.sqrt(2.0 * np.pi))  # a normal density over all pairs, by hand
     log_total = 0.0
     for k in range(len(y)):
-        mean = p.beta0 * x + z[k] @ p.beta + p.b
+        mean = p.beta0 * x + p.beta @ z[k] + p.b
         move = scale * np.exp(-0.5 * ((x[:, None] - mean[None]) / p.delta_w) ** 2)
         weights = move @ weights * step
         if not np.isnan(y[k]):

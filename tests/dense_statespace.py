@@ -150,10 +150,20 @@ def trust_of_params(params, awareness, path=None, *, x0=None):
 
 
 def equations_of_params(params, awareness, path=None, *, x0=None):
-    """Form, drift and offset (..., bound, robot) of a mission under draws of parameters.
+    """Form, drift and offset (draw, bound, robot) of a mission; without (draw,) for one draw."""
+    form, *inputs = _equations_of_draws(params, awareness, path, x0=x0)
+    if params.n_draws > 1:
+        return form, *inputs
+    return Form(*(field[0] if np.ndim(field) > 1 else field for field in form)), *(
+        u[0] for u in inputs
+    )
+
+
+def _equations_of_draws(params, awareness, path=None, *, x0=None):
+    """Form, drift and offset (draw, bound, robot) of a mission under draws of parameters.
 
     Args:
-        params: `TrustParams`, `RobotParams` or `CoupledParams`, whose fields (..., ...) are read.
+        params: `TrustParams`, `RobotParams` or `CoupledParams`, whose fields (draw, ...) are read.
         awareness: Awareness (bound, robot, feature).
         path: Cells from the start on; needed with effects of places.
         x0: Trust before the first bound, if it is known, shape () or (robot,).
@@ -172,7 +182,7 @@ def equations_of_params(params, awareness, path=None, *, x0=None):
         P0 = np.asarray(params.x0_sd)[..., None, None] ** 2 * own
     else:
         m0 = np.asarray(x0) * np.ones(n_robots)
-        P0 = 0.0 * own
+        P0 = 0.0 * own[None]
     if hasattr(params, "B0"):
         form = Form(params.B0, params.Delta_w, m0, P0, params.Delta_v)
         return form, u, np.zeros_like(u)
@@ -183,7 +193,7 @@ def equations_of_params(params, awareness, path=None, *, x0=None):
         return values[..., None] * own
 
     noise = diagonal(params.delta_v) ** 2
-    if params.delta_s is not None:
+    if "delta_s" in params.values:
         noise = noise + np.asarray(params.delta_s)[..., None, None] ** 2
     form = Form(diagonal(params.beta0), diagonal(params.delta_w) ** 2, m0, P0, noise)
     if params.memory == "deviation":
@@ -211,9 +221,9 @@ def of_places(params, path):
     for before, (row, col) in pairwise(path):
         move = STEPS.index((row - before[0], col - before[1]))
         effect = np.zeros(1)
-        if params.place is not None:
+        if "place" in params.values:
             effect = effect + params.place[..., row, col]
-        if params.place_bound is not None:
+        if "place_bound" in params.values:
             effect = effect + params.place_bound[..., move, row, col]
         if params.place_robot is not None:
             effect = effect + params.place_robot.everywhere()[..., move, row, col]

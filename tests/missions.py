@@ -20,7 +20,7 @@ def draw_rates(params, awareness, *, family="gaussian", n_ticks=np.nan, seed=0):
     """Rates (mission, bound, robot) of the pooled model for given parameters."""
     rng, n_robots = np.random.default_rng([0, seed, 0x6D697373]), awareness.shape[2]
     as_map = np.moveaxis(awareness, 2, 0)[:, None]  # (robot, 1, mission, bound, feature)
-    u = np.moveaxis(params.increments(as_map)[:, 0], 0, -1) + params.b
+    u = np.moveaxis(params.inputs(as_map)[0, :, 0], 0, -1)
     if params.memory == "deviation":  # x - u lasts
         first = np.full_like(u[:, :1], params.x0_mean)
         u = u - params.beta0 * np.concatenate([first, u[:, :-1]], axis=1)

@@ -82,14 +82,14 @@ def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cel
     """
     problem = planner.problem
     graph = problem.paths.graph
-    n_states = len(recursion.start)
+    n_states = recursion.start.shape[1]
     state_weights = np.full(n_states, 1.0 / n_states)
     credit = problem.objective.credit(np.arange(graph.longest + 1))
 
     weights = []
     carried = np.zeros(n_states)
     for j in range(graph.longest):
-        carried = carried @ recursion.transition + credit[j] * state_weights
+        carried = carried @ recursion.transition[0] + credit[j] * state_weights
         weights.append(carried)
 
     drift = recursion.drift.reshape(n_states, -1)
@@ -165,7 +165,7 @@ def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Cell]) -> f
     along = recursion.along(path)
     trust = states_along(along).mean(-1)
     value = problem.value_along(problem.bound_cost_along(path), trust, along.noise_sd)
-    return float(value) - problem.failure_along(path)
+    return value.item() - problem.failure_along(path)
 
 
 def _infeasible(problem: Problem, risk: Risk) -> InfeasibleError:

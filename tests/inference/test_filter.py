@@ -24,7 +24,8 @@ def posterior(missions):
 def mixture(n_draws=4, seed=0):
     rng = np.random.default_rng(seed)
     draws = [random_params(rng) for _ in range(n_draws)]
-    return TrustParams(*(np.stack(v) for v in zip(*(d[:7] for d in draws), strict=True)))
+    names = draws[0].values
+    return TrustParams(**{name: np.concatenate([d.values[name] for d in draws]) for name in names})
 
 
 PATH = [(0, 0), (1, 1), (1, 2), (2, 1), (2, 2)]
@@ -182,7 +183,7 @@ def test_impossible_values_leave_the_filter_as_it_was(posterior):
 
 def test_bounds_that_cannot_be_are_named():
     params = mixture()
-    params = params._replace(place=np.zeros((4, 1, 5, 6)))
+    params = params.replace(place=np.zeros((4, 1, 5, 6)))
     live, z, y = TrustFilter(params, n_robots=3), np.full((3, 2), 0.5), [0.5] * 3
     for bound, message in {
         ((0, 0), (-1, 0)): r"\(-1, 0\) is outside the grid of 5 rows and 6 columns",
@@ -202,7 +203,7 @@ def test_bounds_that_cannot_be_are_named():
 
 def constant(p, n=2):
     """The same parameters as draws."""
-    return TrustParams(*(np.repeat(np.asarray(v)[None], n, 0) for v in p[:7]))
+    return p.draw(np.zeros(n, int))
 
 
 @pytest.mark.parametrize("family", ["censored", "beta_binomial"])
@@ -212,11 +213,11 @@ def test_families_are_followed_to_the_trust_of_a_grid(family):
     The weight of a draw is compared with that of one whose trust has no noise.
     """
     p = OF_FAMILY[family]
-    other = p._replace(delta_w=1e-5, x0_sd=1e-5)
+    other = p.replace(delta_w=1e-5, x0_sd=1e-5)
     z, y, _ = counted_missions(family)
     live = TrustFilter(constant(p), n_robots=1, family=family)
-    two = TrustParams(*(np.stack(pair) for pair in zip(p[:7], other[:7], strict=True)))
-    compared = TrustFilter(two, n_robots=1, family=family)
+    two = {name: np.concatenate([p.values[name], other.values[name]]) for name in p.values}
+    compared = TrustFilter(TrustParams(**two), n_robots=1, family=family)
     for j in range(len(y)):
         live.reset()
         compared.reset()
@@ -249,12 +250,12 @@ def test_coupled_robots_without_a_coupling_are_robots_apart(family):
     p, rng, eye = OF_FAMILY[family], np.random.default_rng(1), np.eye(2)[None]
     coupled = CoupledParams(
         p.beta0 * eye,
-        np.stack([b * np.eye(2) for b in p.beta])[None],
+        p.beta[..., None, None] * np.eye(2),
         np.full((1, 2), p.b),
         p.delta_w**2 * eye,
         p.delta_v**2 * eye,
-        np.array([p.x0_mean]),
-        np.array([p.x0_sd]),
+        p.x0_mean,
+        p.x0_sd,
     )
     together = TrustFilter(coupled, family=family)
     apart = TrustFilter(constant(p, 1), 2, family=family)
@@ -322,7 +323,7 @@ def test_a_filter_reads_robots_and_features_by_name(missions):
     other = tb.Workspace.from_awareness(np.zeros((3, 2, 2, 2)), features=("slope", "canopy"))
     with pytest.raises(TrustboError, match="features"):
         TrustFilter(posterior, workspace=other)
-    unnamed = params_of(posterior)._replace(robots=None, features=None)
+    unnamed = params_of(posterior).replace(robots=None, features=None)
     with pytest.raises(TrustboError, match="awareness"):
         TrustFilter(unnamed).update(labelled, y)
 
@@ -345,5 +346,5 @@ def test_variables_of_one_s_own_do_not_matter(posterior):
     own = posterior.copy()
     own["posterior"]["threshold"] = xr.DataArray(0.3)
     own["posterior"]["trust"] = posterior["posterior"]["b"] * np.nan
-    assert params_of(own).by_name.keys() == params_of(posterior).by_name.keys()
+    assert params_of(own).values.keys() == params_of(posterior).values.keys()
     np.testing.assert_array_equal(params_of(own).b, params_of(posterior).b)

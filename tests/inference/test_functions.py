@@ -212,7 +212,7 @@ def test_draws_plan_like_the_parameters_of_a_model_class(posterior, workspace):
     """The drift of `linear` is that of `TrustParams` with the same weights."""
     draws = params_of(posterior, workspace)
     values = posterior["posterior"].to_dataset()
-    n = draws.leading[0]
+    n = draws.n_draws
     params = TrustParams(
         np.full(n, 0.4), values["weight"].values.reshape(n, 2), values["level"].values.ravel(),
         np.full(n, 0.05), np.full(n, 0.05),

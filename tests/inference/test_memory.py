@@ -105,7 +105,7 @@ def test_likelihoods_are_those_of_a_chain_of_deviations(deviations):
     )  # with effects of robots in bounds
     assert params.memory == "deviation"
     weights = {"beta": np.tile(draws["beta"].values, (3, 1)), "b": np.full(3, float(draws["b"]))}
-    of_draw = params.draw(7)._replace(**weights)
+    of_draw = params.draw(7).replace(**weights)
     for j, mission in enumerate(deviations):
         form, drift, offset = equations_of_params(of_draw, mission.awareness, mission.path)
         offset = offset + d[j] * mission.awareness[..., 0]

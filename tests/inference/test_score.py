@@ -78,7 +78,7 @@ def test_log_scores_are_shares_of_simulated_rates(family):
     posterior = fit(missions[:3], PooledTrust(family=family), progress=False)
     mission = missions[4]
     scores = score(posterior, [mission])
-    params, rng, n = params_of(posterior).flat(), np.random.default_rng(1), 100
+    params, rng, n = params_of(posterior), np.random.default_rng(1), 100
     z, y = mission.awareness, mission.contact_rate
     measured, drawn = tb.models.families.FAMILIES[family], []
     for _ in range(n):
@@ -111,7 +111,7 @@ def test_log_scores_of_robots_that_differ_are_marginals_of_their_joint_normal(mo
     missions = simulate_missions(5)
     posterior = fit(missions[:4], model, chains=2, draws=100, check=False, progress=False)
     scores, z = score(posterior, missions[4:]), missions[4].awareness
-    params = params_of(posterior).flat()
+    params = params_of(posterior)
     dense = mission_of_params(params, z)
     sd = np.sqrt(np.diagonal(dense.rate_cov, axis1=1, axis2=2))
     y = missions[4].contact_rate
@@ -121,7 +121,7 @@ def test_log_scores_of_robots_that_differ_are_marginals_of_their_joint_normal(mo
 
 def test_pit_of_rates_that_the_model_draws_are_uniform_with_limits_of_censored_ones():
     """Parameters and rates from one posterior: coverage is exact, point masses among them."""
-    truth = OF_FAMILY["censored"]._replace(delta_w=0.4)
+    truth = OF_FAMILY["censored"].replace(delta_w=0.4)
     z = np.random.default_rng(0).uniform(size=(60, 5, 1, 2))
     model = PooledTrust(family="censored")
     y = draw_rates(truth, z, family="censored")

@@ -46,8 +46,8 @@ def test_without_visited_bounds_all_effects_are_drawn(effects):
     nowhere = effects._replace(known=effects.known[..., :0], column=np.full(SHAPE, -1))
     every = effects.everywhere()
     is_new = effects.column < 0
-    np.testing.assert_array_equal(nowhere.flat().everywhere()[:, :, is_new], every[:, :, is_new])
-    np.testing.assert_array_equal(nowhere.mean().everywhere(), np.zeros((N_ROBOTS, *SHAPE)))
+    np.testing.assert_array_equal(nowhere.everywhere()[:, :, is_new], every[:, :, is_new])
+    np.testing.assert_array_equal(nowhere.mean().everywhere(), np.zeros((1, N_ROBOTS, *SHAPE)))
 
 
 def test_effects_do_not_depend_on_the_bounds_or_draws_that_are_asked_for(effects):
@@ -60,8 +60,8 @@ def test_effects_do_not_depend_on_the_bounds_or_draws_that_are_asked_for(effects
 
     some = np.array([5, 5, 399])
     np.testing.assert_array_equal(effects.draw(some).everywhere(), every[some])
-    np.testing.assert_array_equal(effects.draw(7).everywhere(), every[7])
-    np.testing.assert_array_equal(effects.draw(some).draw(1).everywhere(), every[5])
+    again = effects.draw(some).draw(np.array([1, 2]))
+    np.testing.assert_array_equal(again.everywhere(), every[[5, 399]])
     assert not np.array_equal(effects._replace(seed=4).everywhere(), every)
 
 
@@ -70,7 +70,7 @@ def test_inputs_of_robots_include_their_effects_and_those_of_the_team_do_not(eff
     n = np.full(N_DRAWS, 0.1)
     place = rng.normal(size=(N_DRAWS, 1, *SHAPE[1:]))
     plain = TrustParams(n, rng.normal(size=(N_DRAWS, 2)), n, n, n, place=place)
-    params = plain._replace(place_robot=effects)
+    params = plain.replace(place_robot=effects)
     z = rng.uniform(size=(N_ROBOTS, *SHAPE, 2))
     every = effects.everywhere()
     np.testing.assert_allclose(params.inputs(z), plain.inputs(z) + every, atol=1e-12)
@@ -96,7 +96,6 @@ def test_selected_and_averaged_parameters_keep_the_effects(effects):
 
     some = np.array([3, 8])
     np.testing.assert_array_equal(params.draw(some).inputs(z, bounds), inputs[some])
-    np.testing.assert_array_equal(params.flat().inputs(z, bounds), inputs)
     known = slice(len(VISITED))
-    mean = params.mean().inputs(z, bounds)
+    [mean] = params.mean().inputs(z, bounds)
     np.testing.assert_allclose(mean[:, known], inputs.mean(0)[:, known], atol=1e-12)

@@ -149,7 +149,7 @@ def test_the_graph_of_bounds_is_for_any_algorithm_of_networkx(workspace):
     assert edge["lost"] == pytest.approx(max(0.0, 1.0 - edge["trust"]) + 0.01)
     assert edge["cost"] == pytest.approx(edge["lost"] - 2.0 * np.expm1(-edge["risk"]))
     with pytest.raises(TrustboError, match="beta0"):
-        planner.graph(PARAMS._replace(beta0=1.0))
+        planner.graph(PARAMS.replace(beta0=1.0))
 
 
 def problem_without_memory(rng, objective, **options):
@@ -219,7 +219,7 @@ def test_the_shortest_path_of_networkx_is_at_least_as_good_as_a_plan_of_few_boun
 
 
 def test_costs_of_a_mean_order_the_paths_with_the_same_number_of_bounds(workspace):
-    forgetful = PARAMS._replace(beta0=0.0)
+    forgetful = PARAMS.replace(beta0=0.0)
     planner = Planner(workspace, *ENDS, "mean", bound_cost=0.01, max_bounds="shortest+1")
     graph = planner.graph(forgetful)
     assert min(cost for _, _, cost in graph.edges(data="cost")) >= 0.0
@@ -230,7 +230,7 @@ def test_costs_of_a_mean_order_the_paths_with_the_same_number_of_bounds(workspac
 
 
 def test_failures_cost_at_most_what_the_graph_says(workspace):
-    forgetful = PARAMS._replace(beta0=0.0)
+    forgetful = PARAMS.replace(beta0=0.0)
     p_fail = np.random.default_rng(1).uniform(0.0, 0.2, (8, 5, 6))
     planner = Planner(workspace, *ENDS, failure_cost=2.0).with_risk(p_fail)
     graph = planner.graph(forgetful)
@@ -420,9 +420,6 @@ def test_options_that_are_no_maps_are_refused(workspace):
 
 @pytest.mark.parametrize("value", ["3", b"3", 1j, np.inf, np.nan, 1e24, np.datetime64("2026")])
 @pytest.mark.parametrize("field", ["beta0", "b", "delta_v", "x0_mean"])
-def test_unsafe_parameters_are_refused(workspace, field, value):
-    params = PARAMS._replace(**{field: value})
+def test_unsafe_parameters_are_refused(field, value):
     with pytest.raises(TrustboError, match=field):
-        Planner(workspace, *ENDS).plan(params)
-    with pytest.raises(TrustboError, match=field):
-        expected_trust(params, np.zeros((4, 3, 2)))
+        PARAMS.replace(**{field: value})

@@ -71,10 +71,9 @@ def test_greedy_is_the_best_under_the_mean_and_thompson_under_single_draws(works
 
 def test_thompson_plans_for_one_draw_of_any_chain(workspace):
     planner, draws = Planner(workspace, *ENDS, "terminal"), prior_draws()
-    chains = draws.map(
-        lambda value, _: value.reshape(3, 20, *value.shape[1:]) if np.ndim(value) else value
-    )
-    assert chains.leading == (3, 20)
+    of_chains = {name: v.reshape(3, 20, *v.shape[1:]) for name, v in draws.values.items()}
+    chains = draws.replace(**of_chains)
+    assert chains.n_draws == 60
     for seed in range(5):
         expected = policies.thompson(rng(seed), draws, planner)
         assert policies.thompson(rng(seed), chains, planner).path == expected.path
@@ -91,8 +90,7 @@ def test_optimistic_is_drawn_to_cells_it_knows_nothing_of():
     planner = Planner(known, (1, 0), (1, 4), "mean")
     place = np.zeros((50, 1, 3, 5))
     place[:, 0, 2, 1:4] = np.linspace(-0.2, 0.195, 50)[:, None]
-    one = TrustParams(0.5, np.array([0.5]), 0.0, 0.1, 0.1)
-    draws = TrustParams(*(np.stack([np.asarray(v)] * 50) for v in one[:5]), place=place)
+    draws = TrustParams(0.5, np.array([0.5]), 0.0, 0.1, 0.1, place=place)
     assert (0, 2) in policies.greedy(rng(), draws, planner).path
     assert (2, 2) in policies.optimistic(rng(), draws, planner).path
     median = policies.optimistic(rng(), draws.draw(slice(0, 1)), planner, quantile=0.5)

@@ -117,7 +117,7 @@ def test_trust_is_the_steady_state_averaged_over_the_bounds_that_enter_a_cell(
 
 def test_trust_is_what_expected_trust_tends_to_if_a_bound_is_repeated(workspace):
     draws = sample_prior(CoupledTrust(), 2, 1, 3, n_robots=3).draw(0)
-    draws = draws._replace(B0=0.8 * draws.B0 / np.abs(np.linalg.eigvals(draws.B0)).max())
+    draws = draws.replace(B0=0.8 * draws.B0 / np.abs(np.linalg.eigvals(draws.B0)).max())
     z = np.repeat(workspace.along([(3, 0), (3, 1)]), 200, axis=0)
     found = Planner(workspace, *ENDS).trust(draws, cell=(3, 1), move="e")
     np.testing.assert_allclose(found, expected_trust(draws, z)[-1], rtol=1e-9)

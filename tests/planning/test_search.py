@@ -182,7 +182,7 @@ def test_an_infeasible_limit_is_an_error_with_the_safest_path(workspace):
     assert (str(copied), copied.path) == (str(error.value), error.value.path)
     assert copied.p_fail == error.value.p_fail
     assert planner.evaluate(error.value.path, PARAMS).infeasible
-    assert planner.maps(PARAMS.flat())["path_probability"].sum() == len(error.value.path)
+    assert planner.maps(PARAMS)["path_probability"].sum() == len(error.value.path)
     with pytest.raises(TrustboError, match="max_failure"):
         Planner(workspace, *ENDS, max_failure=0.1).plan(PARAMS)  # without a risk
 
@@ -256,7 +256,7 @@ def test_draws_are_planned_as_one_by_one(workspace):
 
 
 def test_objectives_of_contact_need_memory_that_is_not_negative(workspace):
-    forgetful = PARAMS._replace(beta0=-0.2)
+    forgetful = PARAMS.replace(beta0=-0.2)
     for family in ("gaussian", "censored"):
         with pytest.raises(TrustboError, match="beta0"):
             Planner(workspace, *ENDS, family=family).plan(forgetful)

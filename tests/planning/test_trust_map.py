@@ -43,7 +43,7 @@ def test_a_trust_map_is_the_best_of_all_paths_to_each_cell(workspace, model):
 
 @pytest.mark.parametrize("beta0", [0.4, -0.6])
 def test_the_trust_of_the_goal_is_that_of_the_terminal_plan(workspace, beta0):
-    params = sample_prior(PooledTrust(), 2, 1, seed=1).draw(0)._replace(beta0=beta0)
+    params = sample_prior(PooledTrust(), 2, 1, seed=1).draw(0).replace(beta0=beta0)
     planner = Planner(workspace, *ENDS, "terminal")
     closed = np.random.default_rng(5).uniform(size=(8, 4, 4)) < 0.2
     planner = planner.avoiding(closed, np.zeros((8, 4, 4)))
@@ -64,7 +64,7 @@ def test_the_summary_and_the_cost_are_over_the_maps_of_draws(workspace):
 
 def test_draws_of_several_chains_are_mapped_like_one_axis_of_draws(workspace):
     draws = sample_prior(PooledTrust(), 2, 6, seed=1)
-    flat = draws.flat()  # x0 has no axis of draws otherwise
-    chains = flat.map(lambda value, n: np.reshape(value, (2, 3, *np.shape(value)[1:])))
+    of_chains = {name: v.reshape(2, 3, *v.shape[1:]) for name, v in draws.values.items()}
+    chains = draws.replace(**of_chains)
     planner = Planner(workspace, *ENDS)
     np.testing.assert_array_equal(planner.trust_map(chains), planner.trust_map(draws))

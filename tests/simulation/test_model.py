@@ -138,7 +138,7 @@ def test_true_awareness_and_probabilities_are_read_by_name(workspace):
 
 def test_the_description_tells_kinds_of_memory_apart(workspace):
     simulators = [
-        ModelSimulator(workspace, PARAMS._replace(memory=memory), model=PooledTrust(memory=memory))
+        ModelSimulator(workspace, PARAMS.replace(memory=memory), model=PooledTrust(memory=memory))
         for memory in ("level", "deviation")
     ]
     level, deviation = (simulator.describe()["truth"] for simulator in simulators)

@@ -34,7 +34,6 @@ from trustbo.inference.score import Posteriors
 from trustbo.models.backend import VERSIONS
 from trustbo.models.draws import Draws
 from trustbo.planning import InfeasibleError, Plan, Planner
-from trustbo.planning.problem import with_robots_in_bounds
 from trustbo.simulation import Truth
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -310,7 +309,8 @@ class Result(Summary):
         """Draws of the last posterior, or of the prior before anything was learned."""
         if self._drawn is None:
             return self.draw_prior(_N_PRIOR_DRAWS)
-        return with_robots_in_bounds(*self._drawn)
+        expected, drawn = self._drawn
+        return expected.with_robots_in_bounds(drawn)
 
     @computed
     def trust_map(self) -> xr.DataArray:

@@ -184,11 +184,11 @@ def _read_params(
             "posterior from trustbo.fit with unchanged names."
         )
 
-    x0 = {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")}
-    memory = posterior.attrs.get("memory", "level")
+    others = {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")}
+    others["memory"] = posterior.attrs.get("memory", "level")
     theta = model.derived(parameters)
     return [
-        assemble_params(values, x0, memory)._replace(**places).in_order(*names)  # pyright: ignore
+        assemble_params(values, **others, **places).in_order(*names)
         for values, places in with_effects(
             posterior, model.effects, theta, parameters, names[0], next_mission
         )
@@ -554,7 +554,8 @@ def sample_prior(
 
     prior = _prior(model, n_features, n_robots)
     rng = np.random.default_rng(seed)
-    return assemble_params(prior_parameters(prior, n_draws, rng), model.x0, model.memory)
+    parameters = prior_parameters(prior, n_draws, rng)
+    return assemble_params(parameters, **model.x0, memory=model.memory)
 
 
 def sample_prior_ahead(model: TrustModel, workspace: Workspace, n_draws: int, seed: int) -> Params:
@@ -577,7 +578,7 @@ def sample_prior_ahead(model: TrustModel, workspace: Workspace, n_draws: int, se
 
     theta = model.derived(parameters)
     values, places = with_prior_effects_ahead(workspace, model.effects, theta, parameters, seed)
-    return assemble_params(values, model.x0, model.memory)._replace(**places)  # pyright: ignore
+    return assemble_params(values, **model.x0, memory=model.memory, **places)
 
 
 def with_prior_effects_ahead(
@@ -626,7 +627,7 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
     rng = np.random.default_rng(0)
     parameters = prior_parameters(prior, _N_MEAN, rng, even=True)
     parameters = {name: values.mean(0, keepdims=True) for name, values in parameters.items()}
-    return assemble_params(parameters, model.x0, model.memory)
+    return assemble_params(parameters, **model.x0, memory=model.memory)
 
 
 def _prior(model: TrustModel, n_features: int, n_robots: int) -> Density:

@@ -104,7 +104,7 @@ class TrustFilter:
         """Start the filter before the first bound of a mission.
 
         Args:
-            posterior: DataTree from `fit`, or parameter draws with the leading axis (draw,).
+            posterior: DataTree from `fit`, or draws of parameters.
             n_robots: Number of robots; needed only with `TrustParams`.
             family: Observation family of parameter draws; ignored for a DataTree.
             max_draws: Maximum number of draws; if there are more, evenly spaced draws are selected.
@@ -147,18 +147,16 @@ class TrustFilter:
         self._n_features = posterior.n_features
         posterior.require_valid(self._n_robots, self._n_features)
 
-        flat = posterior.flat()
-        [n_draws] = flat.leading
         max_draws = require_whole("max_draws", max_draws, 1)
-        kept = evenly_spaced(n_draws, max_draws)
-        self.params: Draws = flat.draw(kept)
+        kept = evenly_spaced(posterior.n_draws, max_draws)
+        self.params: Draws = posterior.draw(kept)
         self.likelihood = FAMILIES[family]
         self.space = self.params.state_space(self._n_robots, adds_noise=self.likelihood.adds_noise)
         self.reset()
 
     def reset(self) -> None:
         """Start a new mission with equally weighted draws."""
-        [n] = self.params.leading
+        n = self.params.n_draws
         self._belief = self.start()
         self._log_weight = np.zeros(n)
         self.weights = np.full(n, 1.0 / n)
@@ -166,9 +164,8 @@ class TrustFilter:
 
     def start(self) -> kalman.Belief:
         """Return trust before the first bound under each draw."""
-        offset = np.broadcast_to(self.params.initial_offset, self.params.leading)
-        n_groups = self._n_robots // self.space.n_members
-        return kalman.initial(self.space, n_groups, offset[:, None, None])
+        offset = self.params.initial_offset[:, None, None]
+        return kalman.initial(self.space, self._n_robots // self.space.n_members, offset)
 
     @property
     def state(self) -> TrustState:

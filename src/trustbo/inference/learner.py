@@ -24,7 +24,6 @@ from trustbo.inference.draws import (
     sample_prior_ahead,
 )
 from trustbo.inference.fit import SAMPLERS, fit, require_poolable_with_model
-from trustbo.inference.functions.draws import FunctionDraws
 from trustbo.inference.functions.fit import (
     draws_of_function,
     prior_draws_of_function,
@@ -211,18 +210,18 @@ class ClassLearner:
         features = workspace.features
         model = self._known.for_features(features)
         n_robots = workspace.team.n_robots
-        return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots).flat()
+        return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots)
 
     def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
         """See `Learner.prior_draws_ahead`."""
         model = self._known.for_features(workspace.features)
-        return sample_prior_ahead(model, workspace, n_draws, seed).flat()
+        return sample_prior_ahead(model, workspace, n_draws, seed)
 
     def prior_mean(self, workspace: Workspace) -> Draws:
         """See `Learner.prior_mean`."""
         features = workspace.features
         model = self._known.for_features(features)
-        return prior_mean(model, len(features), n_robots=workspace.team.n_robots).flat()
+        return prior_mean(model, len(features), n_robots=workspace.team.n_robots)
 
 
 class FunctionLearner:
@@ -296,17 +295,17 @@ class FunctionLearner:
         expected, drawn = draws_of_function(self.model, posterior, workspace, [False, True])
         return expected, drawn
 
-    def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> FunctionDraws:
+    def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
         """See `Learner.prior_draws`."""
         return prior_draws_of_function(self.model, n_draws, seed, workspace)
 
-    def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> FunctionDraws:
+    def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
         """See `Learner.prior_draws_ahead`; the variables of single missions are always drawn."""
         return prior_draws_of_function_ahead(self.model, n_draws, seed, workspace)
 
     def prior_mean(self, workspace: Workspace) -> Draws:
         """See `Learner.prior_mean`."""
-        return self.prior_draws(_N_MEAN, 0, workspace).mean().flat()
+        return self.prior_draws(_N_MEAN, 0, workspace).mean()
 
 
 def learner_of(
@@ -384,7 +383,7 @@ def params_of(
     Returns:
         `TrustParams`, `RobotParams` or `CoupledParams`, depending on the model. A pooled model with
         robot effects gives `RobotParams` for the next mission. Their line-of-sight weights include
-        each robot's persistent effect, decayed by one mission. A function gives `FunctionDraws`.
+        each robot's persistent effect, decayed by one mission. A function gives `Draws`.
 
     Raises:
         TrustboError: If the posterior is not from `fit`; a variable is missing or has NaN draws; or

@@ -11,7 +11,7 @@ from numpyro.distributions import Distribution
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import CoupledWeights
 from trustbo.models.model import TrustModel
-from trustbo.models.params import COUPLED_NAMES, CoupledParams
+from trustbo.models.params import COUPLED_DIMS
 from trustbo.statespace import StateSpace
 from trustbo.statespace.form import coupled_robots
 from trustbo.statespace.matrices import namespace
@@ -119,7 +119,7 @@ class CoupledTrust(TrustModel):
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
         """See `TrustModel.dims`."""
-        return {name: CoupledParams.AXES[name] for name in COUPLED_NAMES}
+        return dict(COUPLED_DIMS)
 
 
 def correlation_factor(r: Any, n: int) -> Any:

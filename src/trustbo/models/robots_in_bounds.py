@@ -1,6 +1,6 @@
 """Effects of robots in bounds, which are drawn when they are needed."""
 
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.special import ndtri
@@ -20,10 +20,10 @@ class RobotsInBounds(NamedTuple):
     bound when it is needed.
 
     Attributes:
-        known: Effects in visited bounds, shape (..., robot, visited).
+        known: Effects in visited bounds, shape (draw, robot, visited).
         column: Index of the visited bound in `known`, shape (move, row, col); -1 elsewhere.
-        tau_r: Standard deviation, shape (...,).
-        number: Number of the draw, shape (...,).
+        tau_r: Standard deviation, shape (draw,).
+        number: Number of each draw, shape (draw,), which does not change when draws are selected.
         seed: Random seed.
     """
 
@@ -34,7 +34,7 @@ class RobotsInBounds(NamedTuple):
     seed: int
 
     def at(self, bounds: np.ndarray) -> np.ndarray:
-        """Return the effects (..., robot, bound) in the given bounds; for move -1, they are 0.
+        """Return the effects (draw, robot, bound) in the given bounds; for move -1, they are 0.
 
         Args:
             bounds: Moves, rows and columns, shape (bound, 3).
@@ -49,41 +49,29 @@ class RobotsInBounds(NamedTuple):
         return np.where(which[0] < 0, 0.0, effects)
 
     def _elsewhere(self, bound: np.ndarray) -> np.ndarray:
-        """Draw the effects (..., robot, bound) in bounds that were not visited."""
+        """Draw the effects (draw, robot, bound) in bounds that were not visited."""
         n_robots = self.known.shape[-2]
         robot = np.arange(n_robots)[:, None] * self.column.size
-        draw = self.number[..., None, None] * n_robots * self.column.size
+        draw = self.number[:, None, None] * n_robots * self.column.size
         n = _standard_normal(draw + robot + bound, self.seed)
-        return self.tau_r[..., None, None] * (n - n.mean(-2, keepdims=True))
+        return self.tau_r[:, None, None] * (n - n.mean(-2, keepdims=True))
 
     def everywhere(self) -> np.ndarray:
-        """Return the effects (..., robot, move, row, col) in all bounds."""
+        """Return the effects (draw, robot, move, row, col) in all bounds."""
         bounds = np.indices(self.column.shape).reshape(3, -1).T
         effects = self.at(bounds)
         return effects.reshape(*effects.shape[:-1], *self.column.shape)
 
-    def draw(self, index: Any) -> Self:
-        """Select draws by index."""
-        if not self.number.ndim:
-            return self
+    def draw(self, index: np.ndarray) -> Self:
+        """Select draws by an index array."""
         return self._replace(
-            known=self.known[index],
-            tau_r=np.asarray(self.tau_r[index]),
-            number=np.asarray(self.number[index]),
-        )
-
-    def flat(self) -> Self:
-        """Return the effects with exactly one leading axis (draw,)."""
-        return self._replace(
-            known=self.known.reshape(self.number.size, *self.known.shape[-2:]),
-            tau_r=self.tau_r.ravel(),
-            number=self.number.ravel(),
+            known=self.known[index], tau_r=self.tau_r[index], number=self.number[index]
         )
 
     def mean(self) -> Self:
-        """Average over all draws; effects are 0 in bounds that were not visited."""
-        known = self.flat().known.mean(0)
-        return self._replace(known=known, tau_r=np.zeros(()), number=np.zeros((), int))
+        """Average over draws; effects are 0 in bounds that were not visited."""
+        known = self.known.mean(0, keepdims=True)
+        return self._replace(known=known, tau_r=np.zeros(1), number=np.zeros(1, int))
 
 
 def _standard_normal(counter: np.ndarray, seed: int) -> np.ndarray:

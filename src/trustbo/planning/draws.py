@@ -101,15 +101,14 @@ class DrawnPaths:
 
 
 def choose_draws(params: Draws, n_draws: int | None, seed: int) -> Draws:
-    """Choose `n_draws` draws at random, or all draws if None. The leading axis is (draw,)."""
+    """Choose `n_draws` draws at random, or all draws if None."""
     seed = require_whole("seed", seed, 0)
-    flat = params.flat()
-    n = flat.leading[0]
+    n = params.n_draws
     if n_draws is None or require_whole("n_draws", n_draws, 1) >= n:
-        return flat
+        return params
 
     chosen = np.sort(np.random.default_rng(seed).choice(n, n_draws, replace=False))
-    return flat.draw(chosen)
+    return params.draw(chosen)
 
 
 def drawn_paths(problem: Problem, draws: Draws) -> DrawnPaths:

@@ -67,9 +67,8 @@ def _value_along(
 
     by_robot = trust_recursion(params, z, x0, bounds=bounds, by_robot=True)
     trust = states_along(by_robot)
-    trust = trust.reshape(-1, *trust.shape[-2:])
     bound_cost = problem.bound_cost_along(cells)
-    values = np.atleast_1d(problem.value_along(bound_cost, trust.mean(-1), by_robot.noise_sd))
+    values = problem.value_along(bound_cost, trust.mean(-1), by_robot.noise_sd)
     if not problem.objective.of_contact:
         value = problem.value_along(bound_cost, trust.mean((0, -1)), by_robot.noise_sd)
         return trust, float(value), values

@@ -29,13 +29,14 @@ def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph:
     def of_bounds(values: np.ndarray) -> np.ndarray:
         return np.broadcast_to(values, bounds.shape)[bounds]
 
-    trust = of_bounds(recursion.steady_state())
-    rate = problem.likelihood.mean_rate(of_bounds(contact.steady_state()), recursion.noise_sd)
+    trust = of_bounds(recursion.steady_state()[0])
+    of_contact = of_bounds(contact.steady_state()[0])
+    rate = problem.likelihood.mean_rate(of_contact, recursion.noise_sd)
     lost = of_bounds(problem.bound_cost) + np.maximum(1.0 - rate, 0.0)  # without rounding
     cost, constant = problem.costs_of_bounds(trust, lost)
     values = {
         "length": of_bounds(length[:, None, None]),
-        "drift": of_bounds(recursion.drift.mean(0)),
+        "drift": of_bounds(recursion.drift[0].mean(0)),
         "trust": trust,
         "lost": lost,
         "cost": cost,

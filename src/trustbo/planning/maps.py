@@ -4,7 +4,6 @@ import numpy as np
 import xarray as xr
 
 from trustbo.models.draws import Draws
-from trustbo.models.params import ParameterDraws
 from trustbo.planning.draws import drawn_paths
 from trustbo.planning.problem import InfeasibleError, Problem
 from trustbo.planning.trust_map import cost_of, trust_map
@@ -27,9 +26,8 @@ def maps_of(problem: Problem, draws: Draws) -> xr.Dataset:
         "cost": (cost_of(trust).mean("draw"), "mean cost 1 - sigma(trust)"),
         "path_probability": (passable.copy(data=share), "P(cell on the best path)"),
     }
-    effects = draws.places if isinstance(draws, ParameterDraws) else {}
-    if "place" in effects:
-        place = xr.DataArray(effects["place"].mean(1), dims=("draw", "row", "col"))
+    if draws.linear is not None and draws.linear.place is not None:
+        place = xr.DataArray(draws.linear.place.mean(1), dims=("draw", "row", "col"))
         maps["place_mean"] = place.mean("draw"), "mean place effect"
         maps["place_sd"] = place.std("draw"), "sd of the place effect"
 

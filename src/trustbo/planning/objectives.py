@@ -124,9 +124,8 @@ def capped(objective: Objective, likelihood: Family, recursion: Recursion) -> Re
     if not objective.of_contact or has_history(objective, likelihood):
         return recursion
 
-    axes = recursion.drift.ndim - recursion.start.ndim  # of bounds
     most = 1.0 - recursion.transition.sum(-1)
-    most = most.reshape(*most.shape, *(1,) * axes)
+    most = np.expand_dims(most, tuple(range(2, recursion.drift.ndim)))  # axes of bounds
     return recursion._replace(
         drift=np.minimum(recursion.drift, most),
         start=np.minimum(recursion.start, 1.0),

@@ -295,7 +295,7 @@ class Planner(Summary):
         """Find the best admissible path for a given recursion, such as one with optimistic drifts.
 
         Args:
-            recursion: Recursion for expected trust, without leading axes (see `Problem.recursion`).
+            recursion: Recursion for expected trust with one draw (see `Problem.recursion`).
 
         Raises:
             TrustboError: If beta0 is outside the range in which the search is exact.
@@ -472,7 +472,9 @@ class Planner(Summary):
             per_robot: Whether to compute one map per robot instead of one for the team.
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
         """
-        return trust_map(self.problem, draws_of(params, self.workspace), per_robot=per_robot, x0=x0)
+        draws = draws_of(params, self.workspace)
+        trust = trust_map(self.problem, draws, per_robot=per_robot, x0=x0)
+        return trust if draws.n_draws > 1 else trust.isel(draw=0)
 
     @computing()
     def cost_map(

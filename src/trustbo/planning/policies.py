@@ -56,8 +56,7 @@ def thompson(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
         >>> plan = tb.planning.policies.thompson(rng, params, planner)
     """
     _require(rng, params, planner)
-    draws = params.flat()
-    plan = planner.plan(draws.draw(int(rng.integers(draws.leading[0]))))
+    plan = planner.plan(params.draw(int(rng.integers(params.n_draws))))
     return planner.evaluate(plan.path, params.mean())
 
 
@@ -79,10 +78,10 @@ def optimistic(
     some = choose_draws(params, _N_DRIFTS, _seed(rng))
     drawn = planner.problem.recursion(some)
     optimistic = Recursion(
-        transition=drawn.transition.mean(0),
-        drift=np.quantile(drawn.drift, quantile, axis=0),
-        start=drawn.start.mean(0),
-        noise_sd=drawn.noise_sd.mean(0),
+        transition=drawn.transition.mean(0, keepdims=True),
+        drift=np.quantile(drawn.drift, quantile, axis=0, keepdims=True),
+        start=drawn.start.mean(0, keepdims=True),
+        noise_sd=drawn.noise_sd.mean(0, keepdims=True),
     )
     return planner.evaluate(planner.best_path(optimistic), params.mean())
 
@@ -154,10 +153,10 @@ def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
     _require(rng, params, planner)
 
     recursion = Recursion(
-        transition=np.zeros((1, 1)),
-        drift=rng.uniform(size=(1, *planner.problem.paths.bounds.shape)),
-        start=np.zeros(1),
-        noise_sd=np.full((), 0.1),  # matters only for censored rates
+        transition=np.zeros((1, 1, 1)),
+        drift=rng.uniform(size=(1, 1, *planner.problem.paths.bounds.shape)),
+        start=np.zeros((1, 1)),
+        noise_sd=np.full(1, 0.1),  # matters only for censored rates
     )
     return planner.evaluate(planner.best_path(recursion), params.mean())
 

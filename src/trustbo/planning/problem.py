@@ -16,7 +16,6 @@ from trustbo.hazard.path_risk import ROUNDING, Risk
 from trustbo.inference.learner import expected_and_drawn, params_of
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES, Family
-from trustbo.models.params import ParameterDraws
 from trustbo.planning.labels import best_labels
 from trustbo.planning.limits import LOGISTIC, LOSSES, TINY_SD, Costs
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
@@ -250,7 +249,7 @@ class Problem:
         return EdgeRisks(risks, self.cost_of_failure, weights, limit)
 
     def best(self, recursion: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the best admissible path for each draw of the recursion, or for a single draw.
+        """Find the best admissible path for each draw of the recursion.
 
         Returns:
             Scores (draw,), upper limits on the score of any path (draw,), and paths (draw, cell) as
@@ -262,7 +261,7 @@ class Problem:
         """
         history = has_history(self.objective, self.likelihood)
         self._require_valid(recursion, history)
-        recursion = capped(self.objective, self.likelihood, recursion).flat()
+        recursion = capped(self.objective, self.likelihood, recursion)
 
         graph = self.paths.graph if self.edge_risks is None else self.paths.paired.graph
         n_draws, n_states = recursion.start.shape
@@ -399,7 +398,7 @@ def risks_by_bound(p_fail: np.ndarray) -> np.ndarray:
 def draws_of(
     posterior: Draws | xr.DataTree, workspace: Workspace, *, next_mission: bool = False
 ) -> Draws:
-    """Return the draws of a posterior or parameters, with a leading axis (draw,) if there is one.
+    """Return the draws of a posterior or parameters.
 
     The features and robots are reordered by name to match the workspace, if they have names. See
     `params_of` for `next_mission`. Raises TrustboError if the type, the features or the robots
@@ -411,33 +410,23 @@ def draws_of(
 
 
 def _require_draws(given: object, workspace: Workspace) -> Draws:
-    """Return draws that can be used in a workspace, with at most one leading axis (draw,)."""
+    """Return draws that can be used in a workspace."""
     remedy = "give a posterior from fit, or parameters"
     draws: Draws = require_kind("posterior", given, Draws, remedy)
-    draws = draws.in_order(workspace.team.names, workspace.features)
-    draws.require_valid()
-    return draws.flat() if len(draws.leading) > 1 else draws
+    return draws.in_order(workspace.team.names, workspace.features)
 
 
 def robot_draws_of(posterior: Draws | xr.DataTree, workspace: Workspace) -> Draws:
     """Return the same as `draws_of`, but with the effects of robots in bounds, which plans omit."""
     if isinstance(posterior, xr.DataTree):
-        return with_robots_in_bounds(*expected_and_drawn(posterior, workspace))
+        expected, drawn = expected_and_drawn(posterior, workspace)
+        return expected.with_robots_in_bounds(drawn)
     return _require_draws(posterior, workspace)
 
 
-def with_robots_in_bounds(expected: Draws, drawn: Draws) -> Draws:
-    """Return draws with the expected effects of missions and the effects in bounds of `drawn`."""
-    own = drawn.place_robot if isinstance(drawn, ParameterDraws) else None
-    if own is None:
-        return expected
-    return cast(ParameterDraws, expected)._replace(place_robot=own)  # pyright: ignore[reportAttributeAccessIssue]
-
-
 def mean_of(params: Draws | xr.DataTree, workspace: Workspace) -> Draws:
-    """Return the mean of a posterior or of several draws; a single draw is returned unchanged."""
-    draws = draws_of(params, workspace)
-    return draws.mean() if draws.leading else draws
+    """Return the mean of a posterior or of draws."""
+    return draws_of(params, workspace).mean()
 
 
 def mean_and_draws_of(
@@ -453,6 +442,4 @@ def mean_and_draws_of(
         return expected.mean(), drawn
 
     draws = _require_draws(params, workspace)
-    if not draws.leading:
-        return draws, None
-    return draws.mean(), draws
+    return draws.mean(), draws if draws.n_draws > 1 else None

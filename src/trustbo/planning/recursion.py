@@ -17,8 +17,8 @@ from trustbo.workspace.moves import bounds_along
 class Recursion(NamedTuple):
     """Recursion x_k = transition x_{k-1} + drift(bound) for expected trust, with x_0 = start.
 
-    The shapes are transition (..., state, state), drift (..., state, move, row, col) for a map or
-    (..., state, bound) for a path, start (..., state) and noise_sd (...,). Here, noise_sd is the
+    The shapes are transition (draw, state, state), drift (draw, state, move, row, col) for a map or
+    (draw, state, bound) for a path, start (draw, state) and noise_sd (draw,). Here, noise_sd is the
     mean over robots of the standard deviation of a rate given trust, including the noise that
     robots share. Each robot is a state, and the team's trust is the mean of the states. If all
     robots have the same beta0, the mean trust is the only state. The drift at (move, row, col)
@@ -33,25 +33,20 @@ class Recursion(NamedTuple):
 
     def of_team(self) -> "Recursion":
         """Return the recursion of the mean trust of robots that obey the same equation."""
-        axis = self.start.ndim - 1  # of the states
         return self._replace(
-            transition=self.transition[..., :1, :1],
-            drift=self.drift.mean(axis, keepdims=True),
-            start=self.start.mean(-1, keepdims=True),
+            transition=self.transition[:, :1, :1],
+            drift=self.drift.mean(1, keepdims=True),
+            start=self.start.mean(1, keepdims=True),
         )
 
-    def flat(self) -> "Recursion":
-        """Return the recursion with a leading axis (draw,), of length 1 for a single draw."""
-        return self if self.start.ndim > 1 else Recursion(*(value[None] for value in self))
-
     def along(self, path: Sequence[Cell] | np.ndarray) -> "Recursion":
-        """Return the recursion with the drift of a path's bounds, (..., state, bound)."""
+        """Return the recursion with the drift of a path's bounds, (draw, state, bound)."""
         moves, rows, cols = bounds_along(path).T
         return self._replace(drift=self.drift[..., moves, rows, cols])
 
     def steady_state(self) -> np.ndarray:
-        """Return the limit of the team's trust if a bound is repeated, (..., move, row, col)."""
-        return self.steady_states().mean(self.start.ndim - 1)
+        """Return the limit of the team's trust if a bound is repeated, (draw, move, row, col)."""
+        return self.steady_states().mean(1)
 
     def steady_states(self) -> np.ndarray:
         """Return the limit (I - transition)^-1 drift of each state if a bound is repeated."""
@@ -68,12 +63,12 @@ def trust_recursion(
     bounds: np.ndarray | None = None,
     by_robot: bool = False,
 ) -> Recursion:
-    """Build the recursion for expected trust from draws with leading axes (...,).
+    """Build the recursion for expected trust from draws.
 
     Args:
         draws: Draws of the parameters of any model.
         awareness: Awareness of all bounds of a map, or of `bounds` (see `Draws.inputs`).
-        x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default
+        x0: Expected trust before the first bound, shape (), (robot,) or (draw, robot); by default
             `draws.x0_mean`.
         bounds: Moves, rows and columns (bound, 3) of the bounds of a path, or None for a map.
         by_robot: Whether to use one state per robot even if the team's mean would suffice.
@@ -82,43 +77,42 @@ def trust_recursion(
         TrustboError: If the number of robots or features does not match the parameters.
     """
     n_robots = len(awareness)
-    leading = draws.leading
+    n_draws = draws.n_draws
+    draws.require_valid(n_robots, awareness.shape[-1])
+    if bounds is None:
+        draws.require_grid(awareness.shape[-3:-1])
     space = draws.state_space(n_robots)
-
-    def of_draws(values: np.ndarray) -> np.ndarray:
-        """Give values (draw, ...) the leading axes of the parameters."""
-        return values.reshape((*leading, *values.shape[1:]))
 
     # Expected trust is x_k = A (x_{k-1} - o_{k-1}) + u_k + o_k. Either all inputs are drifts u, or
     # all inputs are offsets o. In the second case, the expected state d = x - o stays 0.
-    transition = of_draws(space.over_robots(n_robots))
+    transition = space.over_robots(n_robots)
     if not draws.carried:
         transition = np.zeros_like(transition)
 
     if x0 is not None:
         start = np.asarray(x0, dtype=float)
     elif draws.carried:  # the robots of a NumPyro function may differ
-        start = of_draws(space.initial_mean.reshape(len(space.initial_mean), -1))
+        start = space.initial_mean.reshape(n_draws, -1)
     else:
-        start = np.asarray(draws.x0_mean, dtype=float)[..., None]
+        start = draws.initial_offset[:, None]
 
     try:
-        start = np.broadcast_to(start, (*leading, n_robots))
+        start = np.broadcast_to(start, (n_draws, n_robots))
     except ValueError:
         raise TrustboError(
-            f"x0 must be one number or have the shape {(*leading, n_robots)}, one for each robot; "
+            f"x0 must be one number or have the shape {(n_draws, n_robots)}, one for each robot; "
             f"got shape {start.shape}."
         ) from None
 
-    noise_sd = of_draws(space.rate_sd.mean((1, 2)))
+    noise_sd = space.rate_sd.mean((1, 2))
     if draws.by_robot or by_robot:
         drift = draws.inputs(awareness, bounds)
-        shape = (*leading, n_robots, *drift.shape[len(leading) + 1 :])
+        shape = (n_draws, n_robots, *drift.shape[2:])
         return Recursion(transition, np.broadcast_to(drift, shape), start, noise_sd)
 
     # With a common beta0, the mean trust of the robots obeys the same equation.
     return Recursion(
-        transition=transition[..., :1, :1],
+        transition=transition[:, :1, :1],
         drift=draws.team_inputs(awareness, bounds),
         start=start.mean(-1, keepdims=True),
         noise_sd=noise_sd,
@@ -135,14 +129,14 @@ def expected_trust(
     """Compute expected trust along a path from equations (1) and (3) without noise.
 
     Args:
-        params: Parameters of any model, with leading axes (...,) such as (draw,).
+        params: Parameters of any model.
         awareness: Situational awareness along the path, shape (bound, robot, feature).
-        x0: Expected trust before the first bound, shape (), (robot,) or (..., robot); by default
+        x0: Expected trust before the first bound, shape (), (robot,) or (draw, robot); by default
             `params.x0_mean`.
         path: Cells of the path, beginning with the start; needed with place effects.
 
     Returns:
-        Expected trust after each bound, shape (..., bound, robot).
+        Expected trust after each bound, shape (draw, bound, robot), or (bound, robot) for one draw.
 
     Raises:
         TrustboError: If the number of robots or features does not match the parameters; the path
@@ -153,8 +147,6 @@ def expected_trust(
         >>> tb.planning.expected_trust(params, awareness, path=path).mean(axis=0)  # (bound, robot)
     """
     require_kind("params", params, Draws, "give parameters, such as TrustParams(...)")
-    params.require_valid()
-
     dims = ("bound", "robot", "feature")
     names = {"robot": params.robots or None, "feature": params.features or None}
     z = read_labelled("awareness", awareness, dims, names).values
@@ -174,13 +166,15 @@ def expected_trust(
         )
 
     of_robots = np.swapaxes(z, 0, 1)
-    return states_along(trust_recursion(params, of_robots, x0, bounds=bounds, by_robot=True))
+    recursion = trust_recursion(params, of_robots, x0, bounds=bounds, by_robot=True)
+    trust = states_along(recursion)
+    return trust if len(trust) > 1 else trust[0]
 
 
 def states_along(along: Recursion) -> np.ndarray:
-    """Compute expected trust (..., bound, state) after each bound of a path."""
-    drift = np.moveaxis(along.drift, -1, 0)  # (bound, ..., state)
+    """Compute expected trust (draw, bound, state) after each bound of a path."""
+    drift = np.moveaxis(along.drift, -1, 0)  # (bound, draw, state)
     trust = [along.start]
     for u in drift:
         trust.append(kalman.step(along.transition, trust[-1], u))
-    return np.stack(trust[1:], axis=-2)
+    return np.stack(trust[1:], axis=1)

@@ -90,7 +90,7 @@ def robot_trust(
         dims = ("draw", "robot")
 
     trust = xr.DataArray(values, {"robot": chosen, **coords}, dims)
-    if not draws.leading:
+    if draws.n_draws == 1:
         trust = trust.isel(draw=0)
     if robot is not None:
         trust = trust.sel(robot=robot)
@@ -185,18 +185,10 @@ def _stationary(bounds: Bounds, draws: Draws) -> Iterator[tuple[Draws, np.ndarra
 
     Trust is NaN for draws in which it diverges.
     """
-    grid = bounds.workspace.grid.shape
-    if draws.grid_shape not in (None, grid):
-        raise TrustboError(
-            f"the parameters are those of a map of {draws.grid_shape} cells (row, col), but the "
-            f"workspace has {grid}."
-        )
-
-    flat = draws.flat()
-    n_draws = flat.leading[0]
+    draws.require_grid(bounds.workspace.grid.shape)
     size = max(1, _NUMBERS // bounds.awareness[..., 0].size)
-    for first in range(0, n_draws, size):
-        part = flat.draw(np.arange(first, min(first + size, n_draws)))
+    for first in range(0, draws.n_draws, size):
+        part = draws.draw(slice(first, first + size))
         recursion = trust_recursion(part, bounds.awareness, bounds=bounds.which, by_robot=True)
 
         radius = np.abs(np.linalg.eigvals(recursion.transition)).max(-1)

@@ -17,8 +17,8 @@ from trustbo.planning.sums import best_sums
 def trust_map(
     problem: Problem, params: Draws, *, per_robot: bool = False, x0: ArrayLike | None = None
 ) -> xr.DataArray:
-    """Compute the trust map; see `Planner.trust_map`."""
-    recursion = problem.recursion(params, x0, by_robot=per_robot).flat()
+    """Compute the trust map with the axis (draw,); see `Planner.trust_map`."""
+    recursion = problem.recursion(params, x0, by_robot=per_robot)
     like = problem.paths.workspace.awareness.isel(move=0, feature=0, drop=True)
     n_states = recursion.start.shape[-1]
 
@@ -29,10 +29,7 @@ def trust_map(
         values = _largest(problem.paths, recursion, np.full(n_states, 1.0 / n_states))
         like = like.isel(robot=0, drop=True)
 
-    if params.leading:
-        trust = like.expand_dims(draw=len(values)).copy(data=values)
-    else:
-        trust = like.copy(data=values[0])
+    trust = like.expand_dims(draw=len(values)).copy(data=values)
     start = path_text([problem.paths.start])  # cell in which trust is assumed; see `plots`
     return trust.rename("trust").assign_attrs(long_name="expected trust", start=start)
 

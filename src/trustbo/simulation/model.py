@@ -76,8 +76,8 @@ class ModelSimulator(DescribedSimulator):
         if self.awareness.shape != shape:
             raise TrustboError(f"awareness must have shape {shape}; got {self.awareness.shape}.")
 
-        if params.leading:
-            raise TrustboError(f"params must be a single draw; got leading axes {params.leading}.")
+        if params.n_draws > 1:
+            raise TrustboError(f"params must be a single draw; got {params.n_draws}.")
         params.require_valid(shape[0], shape[-1])
 
         self.n_ticks = None if n_ticks is None else require_whole("n_ticks", n_ticks, 1)
@@ -97,13 +97,13 @@ class ModelSimulator(DescribedSimulator):
         # Without _STREAM, seed 0 would give the same numbers as `default_rng(0)`.
         rng = np.random.default_rng([0, require_whole("seed", seed, 0), _STREAM])
 
-        params = self.params.flat()
+        params = self.params
         space = params.state_space(n_robots, adds_noise=self.model.likelihood.adds_noise)
         u = params.inputs(z, bounds_along(cells))
         u = np.broadcast_to(u, (1, n_robots, n_bounds))
         inputs = [params.as_inputs(space.grouped(u[..., k])) for k in range(n_bounds)]
 
-        offset = np.broadcast_to(params.initial_offset, 1)[:, None, None]
+        offset = params.initial_offset[:, None, None]
         start = kalman.initial(space, n_robots // space.n_members, offset)
         counts = np.full((n_bounds, n_robots), np.nan if self.n_ticks is None else self.n_ticks)
         ticks = space.grouped(counts)

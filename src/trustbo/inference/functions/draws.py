@@ -1,12 +1,13 @@
 """Draws of a model that is a NumPyro function."""
 
-from collections.abc import Callable, Mapping, Sequence
-from copy import copy
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import jax
 import numpy as np
 
+from trustbo.arrays import Names
 from trustbo.errors import TrustboError
 from trustbo.inference.functions.data import (
     Data,
@@ -17,8 +18,8 @@ from trustbo.inference.functions.data import (
 )
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.models.backend import own_settings
-from trustbo.models.draws import Draws
-from trustbo.models.params import Params, assemble_params
+from trustbo.models.draws import Draws, Drift, Order
+from trustbo.models.params import assemble_params
 from trustbo.statespace import Inputs, StateSpace
 
 _NUMBERS = 4_000_000
@@ -31,198 +32,96 @@ N_CHECKED = 2
 """Number of draws for which `require_plannable` runs the function."""
 
 
-class FunctionDraws(Draws):
-    """Draws of the variables of a function, or the mean form and inputs over these draws.
-
-    To find the inputs of bounds, the function is run on these bounds as one mission.
+@dataclass(frozen=True, eq=False)
+class FunctionDrift:
+    """Drift of a function; to find that of some bounds, they are given to it as one mission.
 
     Attributes:
         model: The function.
-        values: Draws (draw, ...) of its variables by name.
+        values: Draws (draw, ...) of its variables by name, except those of single missions.
         robots: Names of the robots.
         features: Names of the features.
         shape: Number of rows and columns of the map; None without a map.
-        resolution: Resolution of the rates of the fit, if the function adds it to its noise.
-        effects: Effects that are added to the drift, as parameters without other weights; None if
-            there are none.
+        number: Number of each draw, shape (draw,), from which the variables of single missions are
+            drawn.
+        of_mean: Whether the drift is averaged over all draws.
     """
 
-    __slots__ = (
-        "_form",
-        "_is_flat",
-        "_numbers",
-        "_of_mean",
-        "effects",
-        "features",
-        "model",
-        "resolution",
-        "robots",
-        "shape",
-        "values",
-    )
-
-    def __init__(
-        self,
-        model: FunctionModel,
-        values: Mapping[str, np.ndarray],
-        robots: Sequence[str],
-        features: Sequence[str],
-        shape: tuple[int, int] | None,
-        resolution: float = 0.0,
-    ) -> None:
-        """Store the draws; `values` does not include the variables of single missions."""
-        self.model = model
-        self.values = dict(values)
-        self.robots = tuple(robots)
-        self.features = tuple(features)
-        self.shape = shape
-        self.resolution = resolution
-        self.effects: Params | None = None
-        self._numbers = np.arange(len(next(iter(self.values.values()))))  # of the random keys
-        self._of_mean = False
-        self._is_flat = True  # whether a mean has a leading axis
-        self._form: StateSpace | None = None
-
-    def __repr__(self) -> str:
-        what = "mean of " if self._of_mean else ""
-        return f"FunctionDraws({what}{len(self._numbers)} draws of {self.model.in_short()})"
-
-    def in_order(self, robots: Sequence[str], features: Sequence[str]) -> "FunctionDraws":
-        """See `Draws.in_order`; a function cannot change the order, in which it was fitted."""
-        own = {"robot": self.robots, "feature": self.features}
-        require_same_order(self.model.name, own, {"robot": robots, "feature": features})
-        return self
+    model: FunctionModel
+    values: dict[str, np.ndarray]
+    robots: Names
+    features: Names
+    shape: tuple[int, int] | None
+    number: np.ndarray
+    of_mean: bool = False
 
     @property
-    def leading(self) -> tuple[int, ...]:
-        """See `Draws.leading`."""
-        if self._of_mean:
-            return (1,) if self._is_flat else ()
-        return self._numbers.shape
+    def is_shared(self) -> bool:
+        """See `Drift.is_shared`."""
+        return False
 
     @property
     def n_robots(self) -> int:
-        """Number of robots."""
+        """See `Drift.n_robots`."""
         return len(self.robots)
 
     @property
     def n_features(self) -> int:
-        """Number of features."""
+        """See `Drift.n_features`."""
         return len(self.features)
 
     @property
-    def by_robot(self) -> bool:
-        """See `Draws.by_robot`."""
-        transition = self._space.transition
-        return transition.shape[-1] > 1 or transition.shape[1] > 1
-
-    @property
     def grid_shape(self) -> tuple[int, int] | None:
-        """See `Draws.grid_shape`."""
-        if self.effects is not None and self.effects.grid_shape:
-            return self.effects.grid_shape
-        depends = {"cell", "bound"} & {*self.model.inputs}
-        return self.shape if depends else None
+        """See `Drift.grid_shape`."""
+        return self.shape if {"cell", "bound"} & {*self.model.inputs} else None
 
-    @property
-    def carried(self) -> bool:
-        """Inputs are carried over to later bounds."""
-        return True
-
-    @property
-    def x0_mean(self) -> Any:
-        """Mean of trust before the first bound, shape (draw,) or (); averaged over robots."""
-        mean = self._space.initial_mean.mean((1, 2))
-        return mean.reshape(self.leading)
-
-    @property
-    def _space(self) -> StateSpace:
-        """State-space form of each draw or of the mean; it is the same for all bounds."""
-        if self._form is None:
-            space, _ = self._run(self._flat_values(), np.atleast_1d(self._numbers), self.nothing())
-            if self._of_mean:
-                fields = [None if f is None else f.mean(0, keepdims=True) for f in space]
-                space = StateSpace(*fields)
-            self._form = space.with_noise(self.resolution)
-        return self._form
-
-    def nothing(self) -> dict[str, Any]:
-        """Return the inputs of a mission with one bound, and without awareness of it."""
-        return self._data(np.zeros((1, self.n_robots, self.n_features)), np.full((1, 3), -1))
+    def space(self) -> StateSpace:
+        """Return the form (draw, group, member), which is the same for all bounds."""
+        space, _ = self._run(self.nothing())
+        return space
 
     def theta(self) -> dict[str, np.ndarray]:
         """Return the hyperparameters (draw, ...) of the effects; see `models.effects.Theta`."""
-        return self.model.over_draws("theta", 2, self.nothing())(self.values, _keys(self._numbers))
-
-    def adding(
-        self, parameters: Mapping[str, np.ndarray], places: Mapping[str, Any]
-    ) -> "FunctionDraws":
-        """Return the draws with effects; for the arguments, see `inference.draws.with_effects`."""
-        other = copy(self)
-        x0 = {"x0_mean": 0.0, "x0_sd": 0.0}
-        effects = assemble_params(parameters, x0)._replace(**places)  # pyright: ignore
-        other.effects = effects.in_order(self.robots, self.features)
-        return other
-
-    def require_valid(self, n_robots: int | None = None, n_features: int | None = None) -> None:
-        """See `Draws.require_valid`; the values of a posterior are always valid."""
-        for what, given, own in (
-            ("robots", n_robots, self.n_robots),
-            ("features", n_features, self.n_features),
-        ):
-            if given not in (None, own):
-                raise TrustboError(f"the draws are of {own} {what}, not {given}.")
-
-    def state_space(self, n_robots: int, *, adds_noise: bool = True) -> StateSpace:
-        """See `Draws.state_space`."""
-        self.require_valid(n_robots)
-        return self._space
+        return self.model.over_draws("theta", 2, self.nothing())(self.values, _keys(self.number))
 
     def inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
-        """Compute the inputs of bounds by running the function; see `Draws.inputs`.
+        """Compute the drift of bounds by running the function; see `Draws.inputs`.
 
         Raises:
             TrustboError: If the function fails, or an input is not finite.
         """
         shape = awareness.shape[1:-1]
-        z = awareness.reshape(self.n_robots, -1, self.n_features).swapaxes(0, 1)
-        if bounds is None:
-            bounds = np.indices(shape).reshape(3, -1).T
+        z, of_map = _bounds_of(awareness)
+        bounds = of_map if bounds is None else bounds
 
         known = ~np.isnan(z).any((1, 2))
-        drift = np.full((*self.leading, self.n_robots, len(z)), np.nan)
-        drift[..., known] = self._drift(z[known], bounds[known])
-        drift = drift.reshape(*self.leading, self.n_robots, *shape)
-        if self.effects is None:
-            return drift
-        return drift + self.effects.inputs(awareness, bounds if len(shape) == 1 else None)
+        found = self._drift(z[known], bounds[known])
+        drift = np.full((len(found), self.n_robots, len(z)), np.nan)
+        drift[..., known] = found
+        return drift.reshape(*drift.shape[:2], *shape)
 
     def _drift(self, z: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-        """Compute the drift (..., robot, bound); `z` has the shape (bound, robot, feature)."""
+        """Compute the drift (draw, robot, bound); `z` has the shape (bound, robot, feature)."""
         data = self._data(z, bounds)
-        values = self._flat_values()
-        numbers = np.atleast_1d(self._numbers)
-        n_draws = len(numbers)
+        n_draws = len(self.number)
         size = max(1, _NUMBERS // data["awareness"][..., 0].size)
 
         parts = []
         for first in range(0, n_draws, size):
-            some = slice(first, first + size)
-            chosen = {name: v[some] for name, v in values.items()}
-            _, inputs = self._run(chosen, numbers[some], data)
+            _, inputs = self._some(slice(first, first + size))._run(data)
             drift = _by_robot(inputs)[:, 0, : len(z)].swapaxes(1, 2)
-            parts.append(drift.sum(0, keepdims=True) if self._of_mean else drift)
+            parts.append(drift.sum(0, keepdims=True) if self.of_mean else drift)
 
         drift = np.concatenate(parts)
-        if self._of_mean:
-            drift = drift.sum(0) / n_draws
-        return drift.reshape(*self.leading, self.n_robots, len(z))
+        return drift.sum(0, keepdims=True) / n_draws if self.of_mean else drift
 
-    def _run(
-        self, values: dict[str, np.ndarray], numbers: np.ndarray, data: Data
-    ) -> tuple[StateSpace, Inputs]:
-        """Run the function; return the form (draw, group, member) and the inputs."""
-        space, inputs = self.model.over_draws("form", 2, data)(values, _keys(numbers))
+    def _run(self, data: Data, of_missions: Mapping[str, Any] | None = None) -> Any:
+        """Run the function; return the form (draw, group, member) and the inputs.
+
+        `of_missions` are values of the variables of single missions; by default, they are drawn.
+        """
+        values = {**self.values, **(of_missions or {})}
+        space, inputs = self.model.over_draws("form", 2, data)(values, _keys(self.number))
 
         if inputs.drift.shape[1:3] != data["awareness"].shape[:2]:
             raise TrustboError(self._wrong_size())
@@ -245,18 +144,16 @@ class FunctionDraws(Draws):
             'numpyro.plate("mission", len(awareness)).'
         )
 
+    def nothing(self) -> dict[str, Any]:
+        """Return the inputs of a mission with one bound, and without awareness of it."""
+        return self._data(np.zeros((1, self.n_robots, self.n_features)), np.full((1, 3), -1))
+
     def _data(self, z: np.ndarray, bounds: np.ndarray) -> dict[str, Any]:
         """Return the inputs of bounds; `z` has the shape (bound, robot, feature)."""
         data = data_of_bounds(z, bounds, self.features)
         if self.model.needs_observations:
             data["observations"] = observations_of(data)
         return data
-
-    def _flat_values(self) -> dict[str, np.ndarray]:
-        """Return the draws with exactly one leading axis (draw,)."""
-        if self._numbers.ndim:
-            return self.values
-        return {name: values[None] for name, values in self.values.items()}
 
     def require_plannable(self, awareness: np.ndarray) -> None:
         """Raise TrustboError if the drift of a bound depends on anything but this bound.
@@ -268,9 +165,8 @@ class FunctionDraws(Draws):
         Args:
             awareness: Awareness of the map, shape (robot, move, row, col, feature).
         """
-        some = self._some(np.arange(min(N_CHECKED, self._numbers.size)))
-        z = awareness.reshape(self.n_robots, -1, self.n_features).swapaxes(0, 1)
-        bounds = np.indices(awareness.shape[1:-1]).reshape(3, -1).T
+        some = self._some(slice(N_CHECKED))
+        z, bounds = _bounds_of(awareness)
         known = ~np.isnan(z).any((1, 2))
         z = z[known]
         bounds = bounds[known]
@@ -278,7 +174,7 @@ class FunctionDraws(Draws):
         # The variables of single missions have the same values in all runs.
         data = some._data(z, bounds)
         of_missions = some._drawn_for_mission(data)
-        first, inputs = some._run(some.values | of_missions, some._numbers, data)
+        first, inputs = some._run(data, of_missions)
         shapes = {name: site.shape for name, site in some.model.sites(data).items()}
         wanted = _by_robot(inputs)[:, 0, : len(z)]
 
@@ -297,7 +193,7 @@ class FunctionDraws(Draws):
             name: np.repeat(values, 2, axis=1 + (sites[name].mission_axis or 0))
             for name, values in of_missions.items()
         }
-        second, inputs = some._run(some.values | twice, some._numbers, data)
+        second, inputs = some._run(data, twice)
         found = _by_robot(inputs).reshape(len(wanted), -1, self.n_robots)[:, : len(order)]
 
         error = np.abs(found - wanted[:, order]).max(initial=0.0)
@@ -324,57 +220,64 @@ class FunctionDraws(Draws):
             return {}
 
         with own_settings():
-            keys = jax.random.split(jax.random.key(_SEED), self._numbers.size)
+            keys = jax.random.split(jax.random.key(_SEED), len(self.number))
         drawn = self.model.over_draws("prior", 1, data)(keys)
         return {name: drawn[name] for name in names}
 
-    def draw(self, index: Any) -> "FunctionDraws":
-        """See `Draws.draw`."""
-        if not self._of_mean:
-            return self._some(index)
+    def draw(self, index: np.ndarray) -> Self:
+        """See `Drift.draw`; a mean is the only draw."""
+        return self if self.of_mean else self._some(index)
 
-        other = copy(self)
-        other._is_flat = np.ndim(index) > 0  # the mean is the only draw
-        return other._with_effects(lambda effects: effects.draw(index))
+    def _some(self, index: Any) -> Self:
+        """Return some of the draws, also of a mean."""
+        values = {name: array[index] for name, array in self.values.items()}
+        return replace(self, values=values, number=self.number[index])
 
-    def _some(self, index: Any) -> "FunctionDraws":
-        """Return some of the draws, also if the object is a mean."""
-        other = copy(self)
-        other.values = {name: values[index] for name, values in self.values.items()}
-        other._numbers = self._numbers[index]
-        other._of_mean = False
-        other._form = None
-        return other._with_effects(lambda effects: effects.draw(index))
+    def mean(self) -> Self:
+        """See `Drift.mean`."""
+        return replace(self, of_mean=True)
 
-    def mean(self) -> "FunctionDraws":
-        """Average the form and the inputs over all draws; see `Draws.mean`."""
-        other = copy(self.flat())
-        if not other._of_mean:
-            other._of_mean = True
-            other._form = None
-        other._is_flat = False
-        return other._with_effects(lambda effects: effects.mean())
-
-    def flat(self) -> "FunctionDraws":
-        """See `Draws.flat`."""
-        other = copy(self)
-        other.values = self._flat_values()
-        other._numbers = np.atleast_1d(self._numbers)
-        other._is_flat = True
-        return other._with_effects(lambda effects: effects.flat())
-
-    def _with_effects(self, change: Callable[[Params], Params]) -> "FunctionDraws":
-        """Change the effects of a new object, if there are any, and return the object."""
-        if self.effects is not None:
-            self.effects = change(self.effects)
+    def in_order(self, own: Order, wanted: Order) -> Self:
+        """See `Drift.in_order`; a function cannot change the order, in which it was fitted."""
+        require_same_order(self.model.name, own, wanted)
         return self
 
-    def record(self) -> dict[str, Any]:
-        """See `Draws.record`."""
-        return {name: np.asarray(values).tolist() for name, values in self.values.items()}
+
+def function_drift(
+    model: FunctionModel,
+    values: Mapping[str, np.ndarray],
+    robots: Names,
+    features: Names,
+    shape: tuple[int, int] | None,
+) -> FunctionDrift:
+    """Return the drift of a function for draws (draw, ...) of its variables by name."""
+    number = np.arange(len(next(iter(values.values()))))
+    return FunctionDrift(model, dict(values), tuple(robots), tuple(features), shape, number)
 
 
-def no_weights(theta: Mapping[str, np.ndarray], features: Sequence[str]) -> dict[str, np.ndarray]:
+def draws_of_drift(
+    drift: FunctionDrift,
+    resolution: float = 0.0,
+    effects: tuple[Mapping[str, np.ndarray], Mapping[str, Any]] | None = None,
+) -> Draws:
+    """Return draws with the drift of a function.
+
+    Args:
+        drift: The drift.
+        resolution: Resolution of the rates of the fit, if the function adds it to its noise.
+        effects: Parameters and effects of places that are added to the drift; see
+            `inference.draws.with_effects`.
+    """
+    space = drift.space().with_noise(resolution)
+    form = {name: value for name, value in space._asdict().items() if value is not None}
+    drifts: tuple[Drift, ...] = (drift,)
+    if effects is not None:
+        parameters, places = effects
+        drifts += assemble_params(parameters, **places).drifts
+    return Draws(form, drifts, drift.robots, drift.features)
+
+
+def no_weights(theta: Mapping[str, np.ndarray], features: Names) -> dict[str, np.ndarray]:
     """Return parameters (draw, ...) of a model class whose trust consists of effects alone."""
     zeros = np.zeros(len(theta["inverse_gain"]))
     weights = np.zeros((len(zeros), len(features)))
@@ -382,10 +285,17 @@ def no_weights(theta: Mapping[str, np.ndarray], features: Sequence[str]) -> dict
     return {**theta, **none, "beta": weights}
 
 
-def _keys(numbers: np.ndarray) -> Any:
+def _bounds_of(awareness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return awareness (bound, robot, feature) of all bounds, and their indices (bound, axis)."""
+    n_robots = len(awareness)
+    z = awareness.reshape(n_robots, -1, awareness.shape[-1]).swapaxes(0, 1)
+    return z, np.indices(awareness.shape[1:-1]).reshape(len(awareness.shape) - 2, -1).T
+
+
+def _keys(number: np.ndarray) -> Any:
     """Return the random keys of draws, given by number."""
     with own_settings():
-        return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(_SEED), numbers)
+        return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(_SEED), number)
 
 
 def _by_robot(inputs: Inputs) -> np.ndarray:

@@ -29,7 +29,13 @@ from trustbo.inference.functions.data import (
     data_of_example,
     observations_of,
 )
-from trustbo.inference.functions.draws import N_CHECKED, FunctionDraws, no_weights
+from trustbo.inference.functions.draws import (
+    N_CHECKED,
+    FunctionDrift,
+    draws_of_drift,
+    function_drift,
+    no_weights,
+)
 from trustbo.inference.functions.effects import AddedEffects
 from trustbo.inference.functions.function import EFFECTS, Found, FunctionModel
 from trustbo.inference.functions.nuts import require_gradient
@@ -39,6 +45,7 @@ from trustbo.inference.latent import Latent
 from trustbo.inference.place_maps import place_group
 from trustbo.inference.tree import N_PRIOR, add_groups, default_draws, kept_draws, to_datatree
 from trustbo.models.backend import library_attrs
+from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
 from trustbo.models.record import effects_to_record
@@ -303,7 +310,7 @@ def draws_of_function(
     posterior: xr.DataTree,
     workspace: Workspace | None,
     next_mission: Sequence[bool],
-) -> list[FunctionDraws]:
+) -> list[Draws]:
     """Return the draws of a posterior of a function, for the bounds of a workspace.
 
     Args:
@@ -344,22 +351,44 @@ def draws_of_function(
             "of masking them."
         )
     resolution = float(posterior.attrs["resolution"])
-    draws = FunctionDraws(model, values, robots, features, shape, resolution)
+    drift = function_drift(model, values, robots, features, shape)
     effects = effects_of(posterior)
     if not effects:
-        return [draws] * len(next_mission)
+        return [draws_of_drift(drift, resolution)] * len(next_mission)
 
-    theta = draws.theta()
+    theta = drift.theta()
     found = with_effects(
         posterior, effects, theta, no_weights(theta, features), robots, next_mission
     )
-    return [draws.adding(*one) for one in found]
+    return [draws_of_drift(drift, resolution, one) for one in found]
 
 
 def prior_draws_of_function(
     model: FunctionModel, n_draws: int, seed: int, workspace: Workspace
-) -> FunctionDraws:
+) -> Draws:
     """Draw the variables of a function from the prior, without effects, for a workspace."""
+    return draws_of_drift(_prior_drift(model, n_draws, seed, workspace))
+
+
+def prior_draws_of_function_ahead(
+    model: FunctionModel, n_draws: int, seed: int, workspace: Workspace
+) -> Draws:
+    """Draw the variables of a function from the prior, with the effects of the first mission."""
+    drift = _prior_drift(model, n_draws, seed, workspace)
+    effects = model.effects(drift.nothing())
+    if not effects:
+        return draws_of_drift(drift)
+
+    theta = drift.theta()
+    parameters = no_weights(theta, workspace.features)
+    ahead = with_prior_effects_ahead(workspace, effects, theta, parameters, seed)
+    return draws_of_drift(drift, effects=ahead)
+
+
+def _prior_drift(
+    model: FunctionModel, n_draws: int, seed: int, workspace: Workspace
+) -> FunctionDrift:
+    """Draw the variables of a function from the prior; return the drift without effects."""
     awareness = workspace.awareness.values
     n_robots, _, rows, cols, _ = awareness.shape
     features = tuple(workspace.features)
@@ -370,27 +399,13 @@ def prior_draws_of_function(
     values = {name: drawn[name] for name, site in sites.items() if site.mission_axis is None}
     if not values:
         raise TrustboError(f"{model.in_short()} has no variable that is common to all missions.")
-    return FunctionDraws(model, values, workspace.team.names, features, (rows, cols))
-
-
-def prior_draws_of_function_ahead(
-    model: FunctionModel, n_draws: int, seed: int, workspace: Workspace
-) -> FunctionDraws:
-    """Draw the variables of a function from the prior, with the effects of the first mission."""
-    draws = prior_draws_of_function(model, n_draws, seed, workspace)
-    effects = model.effects(draws.nothing())
-    if not effects:
-        return draws
-
-    theta = draws.theta()
-    parameters = no_weights(theta, workspace.features)
-    return draws.adding(*with_prior_effects_ahead(workspace, effects, theta, parameters, seed))
+    return function_drift(model, values, workspace.team.names, features, (rows, cols))
 
 
 def require_plannable(model: FunctionModel, workspace: Workspace) -> None:
     """Raise TrustboError if a function cannot plan in a workspace."""
-    draws = prior_draws_of_function(model, N_CHECKED, 0, workspace)
-    draws.require_plannable(workspace.awareness.values)
+    drift = _prior_drift(model, N_CHECKED, 0, workspace)
+    drift.require_plannable(workspace.awareness.values)
 
 
 def require_learnable(model: FunctionModel, workspace: Workspace, *, by_gradient: bool) -> None:
