@@ -46,7 +46,7 @@ EXAMPLES = [
 @pytest.mark.parametrize("page", EXAMPLES)
 def test_the_examples_of_a_page_run_and_print_what_it_shows(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    text, namespace = page.read_text(), {}
+    text, namespace = page.read_text(), {"__name__": "__main__"}
     with plt.rc_context():
         for block in BLOCK.finditer(text):
             line = text.count("\n", 0, block.start(1))  # so that an error names the page's line
