@@ -24,6 +24,7 @@ Everything is deterministic. Names select the calls whose name begins with one o
 """
 
 import contextlib
+import dataclasses
 import io
 import math
 import os
@@ -307,7 +308,6 @@ def of_data() -> list[Call]:
     }
     fields = {
         "path": one.path,
-        "bounds": one.bounds,
         "status": "ok",
         "features": one.features,
         "robots": one.robots,
@@ -315,7 +315,7 @@ def of_data() -> list[Call]:
     }
     return [
         Call("Mission.from_arrays", tb.Mission.from_arrays, arrays),
-        Call("Mission", tb.Mission, fields),
+        Call("Mission", partial(dataclasses.replace, one), fields),
     ]
 
 

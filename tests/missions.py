@@ -3,7 +3,7 @@
 import numpy as np
 from hypothesis import strategies as st
 
-from trustbo.data import NOWHERE, Bound, Mission
+from trustbo.data import Mission
 from trustbo.models import TrustParams
 from trustbo.models.families import FAMILIES
 
@@ -104,23 +104,37 @@ def missions(draw, *, ticks=True):
         n_run = n_run if mapped else n_planned
         status = draw(st.sampled_from(["stuck", "aborted"])) if n_run < n_planned else "ok"
         path = tuple(tuple(cell) for cell in rng.integers(0, 9, (n_planned + 1, 2)).tolist())
-        bounds, t0 = [], float(draw(st.sampled_from([0.0, 0.1, 7.0 / 3.0])))
-        for k in range(n_run):
+        rows, recorded, starts = [], [], [float(draw(st.sampled_from([0.0, 0.1, 7.0 / 3.0])))]
+        for _ in range(n_run):
             z = rng.uniform(size=(len(robots), n_features)) * (1.0 if mapped else 9.0)
             n_ticks = rng.integers(1, 30, len(robots)).astype(float)
             rate = np.round(rng.uniform(size=len(robots)) * n_ticks) / n_ticks
             duration = rng.uniform(0.1, 99.0, len(robots))
             for values in (z, rate, duration, n_ticks):
                 values[rng.uniform(size=values.shape) < draw(st.sampled_from([0.0, 0.4]))] = np.nan
-            more = {}
+            poses = contact = None
             if ticks and draw(st.booleans()):
                 n = draw(st.integers(1, 4))
-                more["poses"] = rng.normal(size=(n, 1 + len(robots), 3))
-                more["contact"] = rng.uniform(size=(n, len(robots))) < 0.5
-            cell, ended = path[k + 1] if mapped else NOWHERE, status if k == n_run - 1 else "ok"
-            bounds.append(Bound(cell, z, rate, duration, ended, t0, n_ticks=n_ticks, **more))
-            t0 = bounds[-1].t1 + float(rng.choice([0.0, 0.3]))
-        made.append(Mission(path if mapped else (), tuple(bounds), status, features, tuple(robots)))
+                poses = rng.normal(size=(n, 1 + len(robots), 3))
+                contact = rng.uniform(size=(n, len(robots))) < 0.5
+            rows.append((z, rate, duration, n_ticks))
+            recorded.append((poses, contact))
+            ends = starts[-1] + float(np.nanmax(duration, initial=0.0))
+            starts.append(ends + float(rng.choice([0.0, 0.3])))
+        poses, contact = zip(*recorded, strict=True)
+        made.append(
+            Mission(
+                path if mapped else (),
+                *map(np.stack, zip(*rows, strict=True)),
+                starts=tuple(starts[:-1]),
+                bound_status=(*["ok"] * (n_run - 1), status),
+                status=status,
+                features=features,
+                robots=tuple(robots),
+                poses=poses,
+                contact=contact,
+            )
+        )
     return made
 
 

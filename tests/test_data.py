@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from trustbo.data import Bound, Mission
+from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.models import Priors
 from trustbo.team import Robot, Team
@@ -18,6 +18,13 @@ PATH = [(2, 0), (1, 1), (0, 2)]
 
 def arrays(n_bounds=2, n_robots=3, n_features=2):
     return np.full((n_bounds, n_robots, n_features), 0.5), np.full((n_bounds, n_robots), 0.4)
+
+
+def with_ticks(poses, contact):
+    """A mission of two robots and one bound with poses and contact at its ticks."""
+    unknown = np.full((1, 2, 1), np.nan)
+    mission = Mission.from_arrays([(0, 0), (0, 1)], unknown, unknown[..., 0])
+    return replace(mission, poses=(poses,), contact=(contact,))
 
 
 def test_a_user_s_log_becomes_a_mission():
@@ -109,7 +116,7 @@ def test_axes_that_do_not_fit_are_shown():
     with pytest.raises(TrustboError, match="features must be 2 names"):
         Mission.from_arrays(PATH, z, y, features=["one"])
     with pytest.raises(TrustboError, match="at least one"):
-        Mission(tuple(PATH), (), "aborted")
+        Mission.from_arrays(PATH, z[:0], y[:0], status="aborted")
 
 
 def test_unknown_statuses_are_refused_with_the_known_ones():
@@ -118,11 +125,23 @@ def test_unknown_statuses_are_refused_with_the_known_ones():
         Mission.from_arrays(PATH, z, y, status="lost")
 
 
-def test_a_bound_s_rows_must_be_robots():
-    with pytest.raises(TrustboError, match="contact_rate"):
-        Bound((0, 0), np.zeros((2, 2)), np.zeros(3), np.ones(2))
-    with pytest.raises(TrustboError, match=r"duration\[1\] = 0 s must be positive"):
-        Bound((0, 0), np.zeros((2, 2)), np.zeros(2), np.array([1.0, 0.0]))
+def test_a_duration_of_zero_is_named_with_its_bound():
+    z, y = arrays(n_robots=2)
+    with pytest.raises(
+        TrustboError,
+        match=r"duration of the bound into cell \(0, 2\): \[1\] = 0 s must be positive",
+    ):
+        Mission.from_arrays(PATH, z, y, duration=[[1.0, 1.0], [1.0, 0.0]])
+    with pytest.raises(TrustboError, match=r"duration of bound 1: \[0\] = -1 s"):
+        Mission.from_arrays(None, z, y, duration=[-1.0, 1.0])
+
+
+def test_the_bound_of_a_rate_that_is_no_share_of_ticks_is_named():
+    z, y = arrays()
+    with pytest.raises(TrustboError, match=r"contact_rate of .* \(0, 2\): \[2\] = 0.4 .* 1 / 3"):
+        Mission.from_arrays(PATH, z, y, n_ticks=[[5, 5, 5], [5, 5, 3]])
+    with pytest.raises(TrustboError, match=r"n_ticks of .* \(1, 1\): \[0\] = 2.5"):
+        Mission.from_arrays(PATH, z, y, n_ticks=[2.5, 5.0])
 
 
 def test_a_path_must_be_cells_and_arrays_numbers():
@@ -135,9 +154,6 @@ def test_a_path_must_be_cells_and_arrays_numbers():
         Mission.from_arrays([(2.5, 0), (1, 1), (0, 2)], z, y)
     with pytest.raises(TrustboError, match="awareness must be an array of numbers; got 'abc'"):
         Mission.from_arrays(PATH, "abc", y)
-    bound = Bound((1, 1), [[0.5, 0.5]], [0.5], [10.0])  # lists will do
-    with pytest.raises(TrustboError, match=r"bound 1 enters \(1, 1\), but the path has \(0, 2\)"):
-        Mission(((0, 1), (0, 2)), (bound,))
 
 
 def test_a_missing_duration_does_not_stop_the_clock():
@@ -169,12 +185,10 @@ def test_a_mission_takes_another_awareness_and_keeps_its_rates():
 
 
 def test_a_mission_with_another_awareness_shares_its_ticks():
-    poses, contact = np.zeros((5, 3, 3)), np.ones((5, 2))
-    z = np.full((2, 2), 0.5)
-    bound = Bound((0, 1), z, np.ones(2), np.ones(2), poses=poses, contact=contact)
-    mission = Mission(((0, 0), (0, 1)), (bound,))
-    [changed] = mission.with_awareness(z[None] / 2.0).bounds
-    np.testing.assert_array_equal(changed.awareness, z / 2.0)
+    mission = with_ticks(np.zeros((5, 3, 3)), np.ones((5, 2)))
+    [bound] = mission.bounds
+    [changed] = mission.with_awareness(mission.awareness / 2.0).bounds
+    np.testing.assert_array_equal(changed.awareness, bound.awareness / 2.0)
     assert changed.poses is bound.poses
     assert changed.contact is bound.contact
 
@@ -203,17 +217,15 @@ def test_robots_and_teams_are_checked():
         Team(n_robots=2, names=("a", "a"))
 
 
-def test_bounds_of_odd_shapes_are_named():
-    z, y, seconds = np.full((3, 2), 0.5), np.full(3, 0.4), np.full(3, 10.0)
+def test_arrays_of_odd_shapes_are_shown():
+    z, y = arrays()
     with pytest.raises(TrustboError, match="awareness"):
-        Bound((1, 1), z[0], y, seconds)
-    with pytest.raises(TrustboError, match="contact_rate"):
-        Bound((1, 1), z, y[:2], seconds)
-    with pytest.raises(TrustboError, match=r"n_ticks of a bound must be \(3,\); got shape \(2,\)"):
-        Bound((1, 1), z, y, seconds, n_ticks=np.full(2, 5.0))
-    bounds = [Bound((1, 1), z, y, seconds), Bound((0, 2), z[:, :1], y, seconds)]
-    with pytest.raises(TrustboError, match=r"bounds disagree on \(robot, feature\)"):
-        Mission(tuple(PATH), tuple(bounds))
+        Mission.from_arrays(PATH, z[0], y)
+    with pytest.raises(TrustboError, match=r"n_ticks must be \(2, 3\); got \(2, 2\)"):
+        Mission.from_arrays(PATH, z, y, n_ticks=np.full((2, 2), 5.0))
+    for name, values in (("duration", np.ones((2, 2))), ("n_ticks", np.ones(2))):
+        with pytest.raises(TrustboError, match=r"\(2, 3, 2\)"):
+            replace(Mission.from_arrays(PATH, z, y), **{name: values})
 
 
 def test_durations_and_ticks_are_read_by_name_as_rates_are():
@@ -249,9 +261,9 @@ def test_what_cannot_carry_the_labels_is_refused():
         with pytest.raises(TrustboError, match="awareness"):
             Mission.from_arrays(PATH[:2], awareness, y)
     with pytest.raises(TrustboError, match="awareness"):
-        Bound((0, 0), 0.5, [0.5], [1.0])
+        Mission.from_arrays(PATH[:2], 0.5, y)
     with pytest.raises(TrustboError, match="contact_rate"):
-        Bound((0, 0), z[0], pd.Series({"husky": 0.5}), [1.0])
+        Mission.from_arrays(PATH[:2], z, pd.Series({"husky": 0.5}))
 
 
 def test_negative_cells_are_refused():
@@ -315,37 +327,52 @@ def test_a_mission_keeps_its_data_when_the_arrays_of_a_log_are_used_again():
     np.testing.assert_array_equal(mission.bounds[0].duration, 20.0)
 
 
-def test_lists_of_cells_and_bounds_are_the_same_mission_as_tuples():
+def test_lists_of_cells_and_statuses_are_the_same_mission_as_tuples():
     """A mission that is told again must be recognised."""
     mission = Mission.from_arrays(PATH, *arrays())
-    listed = Mission([list(cell) for cell in mission.path], list(mission.bounds))
+    listed = replace(
+        mission,
+        path=[list(cell) for cell in mission.path],
+        bound_status=list(mission.bound_status),
+        robots=list(mission.robots),
+    )
     assert listed.has_same_data(mission)
     assert listed.path == mission.path
-    assert isinstance(listed.bounds, tuple)
+
+
+def test_bounds_are_views_of_the_arrays_of_their_mission():
+    z, y = arrays()
+    mission = Mission.from_arrays(PATH, z, y, duration=[10.0, 20.0], n_ticks=[5, 10])
+    for name in ("awareness", "contact_rate", "duration", "n_ticks"):
+        whole = getattr(mission, name)
+        for k, bound in enumerate(mission.bounds):
+            np.testing.assert_array_equal(getattr(bound, name), whole[k])
+            assert np.shares_memory(getattr(bound, name), whole)
+        with pytest.raises(ValueError, match="read-only"):
+            whole[...] = 0.0
 
 
 def test_a_failure_in_the_last_bound_is_not_lost():
     z, y = arrays()
-    bounds = Mission.from_arrays(PATH, z, y, status="stuck").bounds
     with pytest.raises(TrustboError, match="stuck"):
-        Mission(PATH, bounds)
+        replace(Mission.from_arrays(PATH, z, y, status="stuck"), status="ok")
 
 
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("duration", [np.inf, 1.0]),
-        ("n_ticks", [np.inf, 2.0]),
-        ("poses", np.zeros((5, 2, 3))),  # without the lead
-        ("contact", np.zeros((5, 3), bool)),
-        ("t0", np.nan),
-        ("cell", (0.5, 1)),
+        ("duration", np.array([[np.inf, 1.0]])),
+        ("n_ticks", np.array([[np.inf, 2.0]])),
+        ("poses", (np.zeros((5, 2, 3)),)),  # without the lead
+        ("contact", (np.zeros((5, 3), bool),)),
+        ("starts", (np.nan,)),
+        ("path", ((0, 0), (0.5, 1))),
     ],
 )
 def test_what_is_no_measurement_of_a_bound_is_refused(name, values):
-    given = {"cell": (0, 1), "duration": np.ones(2)} | {name: values}
+    mission = with_ticks(None, None)
     with pytest.raises(TrustboError, match=name):
-        Bound(awareness=np.full((2, 2), 0.5), contact_rate=np.full(2, 0.5), **given)
+        replace(mission, **{name: values})
 
 
 def test_a_log_without_bounds_is_refused():
@@ -366,16 +393,14 @@ def test_a_log_without_bounds_is_refused():
 )
 def test_poses_and_contact_of_a_bound_have_the_same_ticks(n_poses, contact, match):
     poses = None if n_poses is None else np.zeros((n_poses, 3 if n_poses else 2, 3))
-    unknown = np.full((2, 1), np.nan)
     with pytest.raises(TrustboError, match=match):
-        Bound((0, 1), unknown, unknown[:, 0], unknown[:, 0], poses=poses, contact=contact)
+        with_ticks(poses, contact)
 
 
 def test_contact_at_ticks_may_be_numbers():
-    unknown = np.full((2, 1), np.nan)
     contact = np.array([[1, 0], [1, 1], [0, 0]])
     poses = np.zeros((3, 3, 3))
-    bound = Bound((0, 1), unknown, unknown[:, 0], unknown[:, 0], poses=poses, contact=contact)
+    [bound] = with_ticks(poses, contact).bounds
     np.testing.assert_array_equal(bound.contact, contact)
     poses[...] = contact[...] = 1
     assert not bound.poses.any()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import trustbo as tb
-from trustbo.data import NOWHERE, Bound, Mission
+from trustbo.data import NOWHERE, Mission
 from trustbo.errors import TrustboError
 from trustbo.inference.draws import missions_of
 from trustbo.logs import read_missions, read_table, to_frame, write_missions
@@ -103,10 +103,7 @@ def test_a_path_is_given_or_not():
         Mission.from_arrays([], z, y)
     with pytest.raises(TrustboError, match="awareness"):
         Mission.from_arrays(None, z + np.inf, y)
-    bound = Bound((0, 1), z[0], y[0], np.ones(1))
-    with pytest.raises(TrustboError, match=r"\(0, 1\)"):
-        Mission((), (bound,))
     with pytest.raises(TrustboError, match="at least one"):
-        Mission((), ())
+        Mission.from_arrays(None, z[:0], y[:0])
     failed = Mission.from_arrays(None, z, y, status="stuck")
     assert failed.status == failed.bounds[-1].status == "stuck"

@@ -17,10 +17,8 @@ from trustbo.errors import (
     require_cells,
     require_choice,
     require_finite,
-    require_kind,
     require_list,
     require_order,
-    require_pair,
     require_whole,
 )
 
@@ -36,13 +34,19 @@ _USUAL_LEVELS = 7
 """Number of levels of the scales "likert" and "ordinal"."""
 LINE_OF_SIGHT = "line_of_sight"
 """Feature name of the predicted contact rate; `line_of_sight_1`, `_2`, ... for several."""
+MEASURED = ("awareness", "contact_rate", "duration", "n_ticks")
+"""Names of the arrays of a mission, which have the axes bound and robot."""
+_DIMS = ("bound", "robot", "feature")
+"""Axes of awareness, in order; the other arrays have the first two."""
+_COLUMNS = (*MEASURED, "bound_status", "starts", "poses", "contact")
+"""What a mission holds of each bound, in the order of the attributes of `Bound` after the cell."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Bound:
-    """Measurements of one bound, one row per overwatching robot.
+    """Measurements of one bound, one row per overwatching robot: an entry of `Mission.bounds`.
 
-    The measurements are copied, so the given arrays may be used again.
+    `Mission` checks the values.
 
     Attributes:
         cell: Planning cell entered, (row, col); `NOWHERE` in a log without a map.
@@ -50,20 +54,14 @@ class Bound:
             a log without a map; NaN where not measured.
         contact_rate: Fraction of time in contact, shape (robot,); NaN where not measured.
         duration: Running time of the bound, shape (robot,), s; NaN where not recorded.
+        n_ticks: Number of ticks over which `contact_rate` is averaged, shape (robot,); NaN where
+            not recorded.
         status: Outcome of the bound, `"ok"` or the reason why the lead did not complete it.
         t0: Start of the bound, s since the mission's start.
         poses: Shape (tick, 1 + robot, 3), the lead first: x and y in CRS metres, heading in rad
             from east, anticlockwise. None where not recorded.
         contact: Whether each robot has contact at each tick, shape (tick, robot), at the ticks of
             `poses`. None where not recorded.
-        n_ticks: Number of ticks over which `contact_rate` is averaged, shape (robot,); NaN where
-            not recorded.
-
-    Raises:
-        TrustboError: The arrays disagree on the number of robots or ticks, a value is outside
-            [0, 1], a duration is infinite or not positive, n_ticks is not a positive whole number,
-            a rate is not a multiple of 1 / n_ticks, contact at a tick is neither True nor False, or
-            the status is unknown.
 
     Example:
         >>> bound = mission.bounds[0]
@@ -76,57 +74,11 @@ class Bound:
     awareness: np.ndarray
     contact_rate: np.ndarray
     duration: np.ndarray
+    n_ticks: np.ndarray
     status: str = "ok"
     t0: float = 0.0
     poses: np.ndarray | None = None
     contact: np.ndarray | None = None
-    n_ticks: np.ndarray = None  # pyright: ignore[reportAssignmentType]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "cell", require_pair("the cell of a bound", self.cell))
-        object.__setattr__(self, "t0", require_finite("t0 of a bound", self.t0))
-        object.__setattr__(self, "awareness", _unnamed("awareness", self.awareness))
-        if self.awareness.ndim != 2 or not self.awareness.size:
-            raise TrustboError(
-                "awareness of a bound must have shape (robot, feature) without zeros; got "
-                f"{self.awareness.shape}. If you have no features, give one feature that is 0."
-            )
-        for name in ("contact_rate", "duration", "n_ticks"):
-            given = getattr(self, name)
-            values = np.full(len(self.awareness), np.nan) if given is None else given
-            object.__setattr__(self, name, _unnamed(name, values))
-
-        per_robot = self.awareness.shape[:1]
-        for name in ("contact_rate", "duration"):
-            shape = getattr(self, name).shape
-            if shape != per_robot:
-                raise TrustboError(f"{name} of a bound must be {per_robot}; got shape {shape}.")
-
-        require_choice("status", self.status, STATUSES)
-
-        mapped = self.cell != NOWHERE
-        where = f"the bound into cell {self.cell}" if mapped else "a bound without a map"
-        rates = require_unit_interval(f"contact_rate of {where}", self.contact_rate)
-        object.__setattr__(self, "contact_rate", rates)
-        if mapped:
-            z = require_unit_interval(f"awareness of {where}", self.awareness)
-            object.__setattr__(self, "awareness", z)
-        elif np.isinf(self.awareness).any():
-            raise TrustboError(f"awareness of {where} must be finite, or NaN where not measured.")
-
-        is_bad = (self.duration <= 0.0) | np.isinf(self.duration)
-        if is_bad.any():
-            i = np.flatnonzero(is_bad)[0]
-            raise TrustboError(
-                f"duration[{i}] = {self.duration[i]:g} s must be positive and finite."
-            )
-
-        ticks = require_shares(self.contact_rate, self.n_ticks)
-        object.__setattr__(self, "n_ticks", ticks)
-        _require_recorded(len(self.awareness), self.poses, self.contact)
-        for name in ("poses", "contact"):
-            values = getattr(self, name)
-            object.__setattr__(self, name, None if values is None else np.array(values))
 
     def __repr__(self) -> str:
         rates = ", ".join(f"{rate:.3f}" for rate in self.contact_rate)
@@ -143,15 +95,26 @@ class Bound:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Mission(Summary):
-    """One traversal of a path: the bounds that were run, and the outcome.
+    """One traversal of a path: the measurements of the bounds that were run, and the outcome.
+
+    `from_arrays` makes a mission of the arrays of a log, which may carry labels. The arrays of a
+    mission are read-only copies of those given.
+
+    Bound k enters `path[k]`. If the mission ended early, there are fewer bounds than planned, and
+    the last one has the status of the mission. If the mission continued after a bound that failed,
+    the next bound starts in the cell of the failed bound; a lead that did not stay there has first
+    driven a bound back to the previous cell.
 
     Attributes:
         path: Planned cells, start first, each (row, col); empty in a log without a map.
-        bounds: Bounds that were run; bound k enters `path[k]`. If the mission ended early, there
-            are fewer bounds than planned, and the last one has the status of the mission. If the
-            mission continued after a bound that failed, the next bound starts in the cell of the
-            failed bound; a lead that did not stay there has first driven a bound back to the
-            previous cell.
+        awareness: Situational awareness, shape (bound, robot, feature), in [0, 1], or any finite
+            values in a log without a map; NaN where not measured.
+        contact_rate: Fraction of time in contact, shape (bound, robot); NaN where not measured.
+        duration: Running times, shape (bound, robot), s; NaN where not recorded.
+        n_ticks: Number of ticks over which `contact_rate` is averaged, shape (bound, robot); NaN
+            where not recorded.
+        starts: Start of each bound, s since the mission's start.
+        bound_status: Outcome of each bound, `"ok"` or the reason why the lead did not complete it.
         status: `"ok"` if the mission reached the goal; otherwise, the reason why it did not.
         features: Names of the features, in the order of the last axis of `awareness`.
         robots: Names of the overwatching robots.
@@ -159,10 +122,15 @@ class Mission(Summary):
             reports instead of contact (see `logs.read_reports`); empty in all other missions.
         map: Name of the map to which the cells belong, if it is not the workspace of the missions
             that are fitted together. Places on different maps have independent effects.
+        poses: Poses of the team at the ticks of each bound, as in `Bound`; None where not recorded.
+        contact: Contact at the ticks of each bound, as in `Bound`; None where not recorded.
 
     Raises:
-        TrustboError: The bounds do not fit the path, or disagree on robots or features, the last
-            bound failed although the status is "ok", or the status or the scale is unknown.
+        TrustboError: The bounds do not fit the path, the arrays disagree on the number of bounds,
+            robots or ticks, a value is outside [0, 1], a duration is infinite or not positive,
+            n_ticks is not a positive whole number, a rate is not a multiple of 1 / n_ticks, contact
+            at a tick is neither True nor False, the last bound failed although the status is "ok",
+            or a status or the scale is unknown.
 
     Example:
         >>> rates = np.array([[0.9, 1.0], [0.4, 0.8]])  # (bound, robot)
@@ -173,68 +141,101 @@ class Mission(Summary):
     """
 
     path: tuple[Cell, ...]
-    bounds: tuple[Bound, ...]
+    awareness: np.ndarray
+    contact_rate: np.ndarray
+    duration: np.ndarray
+    n_ticks: np.ndarray
+    starts: tuple[float, ...]
+    bound_status: tuple[str, ...]
     status: str = "ok"
     features: tuple[str, ...] = ()
     robots: tuple[str, ...] = ()
     scale: str = ""
     map: str = ""
+    poses: tuple[np.ndarray | None, ...] = ()
+    contact: tuple[np.ndarray | None, ...] = ()
 
     def __post_init__(self) -> None:
-        require_choice("status", self.status, STATUSES)
-        require_kind("path", self.path, Sequence, "give the cells in a tuple; () without a map")
-        object.__setattr__(self, "path", require_cells("path", self.path))
-        for bound in require_kind("bounds", self.bounds, Sequence, "give the bounds in a tuple"):
-            require_kind("bounds", bound, Bound, "give a tuple of Bound")
-        object.__setattr__(self, "bounds", tuple(self.bounds))
+        for status in (self.status, *self.bound_status):
+            require_choice("status", status, STATUSES)
+        if not isinstance(self.scale, str) or self.scale:
+            levels_of(self.scale)
 
-        self._require_fit()
+        kept: dict[str, Any] = {
+            "path": require_cells("path", self.path),
+            "bound_status": tuple(self.bound_status),
+        }
+        kept |= self._measurements() | self._ticks()
 
-        shapes = {bound.awareness.shape for bound in self.bounds}
-        if len(shapes) > 1:
-            raise TrustboError(f"bounds disagree on (robot, feature): {sorted(shapes)}.")
-        n_robots, n_features = shapes.pop()
-
+        _, n_robots, n_features = self.awareness.shape
         usual_names = {
             "features": default_features(n_features),
             "robots": default_robots(n_robots),
         }
         for name, usual in usual_names.items():
-            labels = as_names(name, getattr(self, name)) or usual
-            if len(labels) != len(usual):
-                raise TrustboError(f"{name} must be {len(usual)} names; got {labels}.")
-            object.__setattr__(self, name, labels)
+            kept[name] = as_names(name, getattr(self, name)) or usual
+            if len(kept[name]) != len(usual):
+                raise TrustboError(f"{name} must be {len(usual)} names; got {kept[name]}.")
 
-        if not isinstance(self.scale, str) or self.scale:
-            levels_of(self.scale)
+        for name, value in kept.items():
+            object.__setattr__(self, name, value)
+        self._require_fit()
+
+    def _measurements(self) -> dict[str, Any]:
+        """Check and copy the arrays; a message names the first bound whose values are wrong."""
+        given = [getattr(self, name) for name in MEASURED]
+        _require_axes(*given)
+        mapped = len(self.path) > 0
+        try:
+            checked = _checked("the bounds", mapped, *given)
+        except TrustboError:
+            for k, of_bound in enumerate(zip(*given, strict=True)):
+                _checked(self._name_of(k), mapped, *of_bound)
+            raise
+        return {n: _own(values, float) for n, values in zip(MEASURED, checked, strict=True)}
+
+    def _ticks(self) -> dict[str, Any]:
+        """Check and copy the start of each bound, and the poses and contact at its ticks."""
+        n_bounds, n_robots = self.contact_rate.shape
+        unknown = (None,) * n_bounds
+        poses = self.poses or unknown
+        contact = self.contact or unknown
+        for k, of_bound in enumerate(
+            zip(poses, contact, self.starts, self.bound_status, strict=True)
+        ):
+            _require_recorded(self._name_of(k), n_robots, *of_bound[:2])
+        return {
+            "starts": tuple(require_finite("starts of bounds", t0) for t0 in self.starts),
+            "poses": tuple(_own(values, float) for values in poses),
+            "contact": tuple(_own(values, bool) for values in contact),
+        }
 
     def _require_fit(self) -> None:
         """Raise TrustboError unless the bounds and the status fit the path."""
-        n_run = len(self.bounds)
+        n_run = len(self.contact_rate)
         n_planned = len(self.path) - 1
-        if not n_run or (self.path and n_run > n_planned):
-            most = f" and at most {n_planned} on its path" if self.path else ""
+        if self.path and n_run > n_planned:
             raise TrustboError(
-                f"a mission has at least one bound{most}; got {n_run}. If no bound was run, use "
-                "`Campaign.fail`."
+                f"{n_run} bounds need a path of at least {n_run + 1} cells; got {len(self.path)}. "
+                "Give None for a log without a map."
             )
-        if self.status == "ok" and n_run < n_planned:
+        last = self.bound_status[-1]
+        if self.status == "ok" and (n_run < n_planned or last != "ok"):
             raise TrustboError(
-                f'status "ok" means that the goal was reached, but only {n_run} of {n_planned} '
-                "bounds were run; give the status of the last one."
+                'status "ok" means that the goal was reached, but the mission has run '
+                f"{n_run} of {n_planned} bounds, and the last one has the status {last!r}; give "
+                "the status of the mission."
             )
-        if self.status == "ok" and self.bounds[-1].status != "ok":
+        if min(map(min, self.path), default=0) < 0:  # would be read from the other end
             raise TrustboError(
-                'status "ok" means that the goal was reached, but the status of the last bound is '
-                f"{self.bounds[-1].status!r}; give this status to the mission."
+                f"rows and columns are counted from 0, but the path is {self.path}; give path=None "
+                "for a log without a map."
             )
 
-        _require_counted(self.path)
-        for k, bound in enumerate(self.bounds, start=1):
-            expected = self.path[k] if self.path else NOWHERE
-            if bound.cell != expected:
-                there = "there is no path" if expected == NOWHERE else f"the path has {expected}"
-                raise TrustboError(f"bound {k} enters {bound.cell}, but {there}.")
+    def _name_of(self, k: int) -> str:
+        """Return what messages call bound k, counted from 0."""
+        mapped = len(self.path) > k + 1
+        return f"the bound into cell {tuple(self.path[k + 1])}" if mapped else f"bound {k + 1}"
 
     def _rows(self) -> Rows:
         rates = self.contact_rate
@@ -245,7 +246,7 @@ class Mission(Summary):
 
         return [
             ("path", planned if self.path else "none: no map"),
-            ("outcome", f"{self.status}, {len(self.bounds)} bounds run"),
+            ("outcome", f"{self.status}, {len(rates)} bounds run"),
             (measured, f"{np.isnan(rates).sum()} missing"),
             *((f"  {name}", f"{rate:.3f}") for name, rate in by_robot),
             ("features", joined(self.features)),
@@ -295,58 +296,49 @@ class Mission(Summary):
                 status is unknown.
         """
         names = {"robot": as_names("robots", robots), "feature": as_names("features", features)}
-        z = _read(names, "awareness", awareness, ("bound", "robot", "feature"))
-        y = _read(names, "contact_rate", contact_rate, ("bound", "robot"))
-        if z.ndim != 3 or y.shape != z.shape[:2] or not len(y):
-            raise TrustboError(
-                "awareness must be (bound, robot, feature) and contact_rate (bound, robot), with "
-                f"at least one bound; got {z.shape} and {y.shape}."
-            )
+        z = read_labelled("awareness", awareness, _DIMS, names)
+        names |= z.coords
+        y = read_labelled("contact_rate", contact_rate, _DIMS[:2], names)
+        names |= y.coords
+        _require_axes(z.values, y.values)
 
-        known = names["robot"] or default_robots(y.shape[1])
-        seconds = _per_robot("duration", duration, known, y.shape)
-        ticks = _per_robot("n_ticks", n_ticks, known, y.shape)
+        shape = y.values.shape
+        known = names["robot"] or default_robots(shape[1])
+        seconds = _per_robot("duration", duration, known, shape)
+        ticks = _per_robot("n_ticks", n_ticks, known, shape)
 
         cells = () if path is None else require_cells("path", path)
-        if path is not None and len(cells) <= len(y):
-            raise TrustboError(
-                f"{len(y)} bounds need a path of at least {len(y) + 1} cells; got {len(cells)}. "
-                "Give None for a log without a map."
-            )
+        if path is not None and not cells:
+            raise TrustboError("path must contain cells; give None for a log without a map.")
 
         if isinstance(status, str):
-            statuses = [*["ok"] * (len(y) - 1), status]
+            statuses = [*["ok"] * (shape[0] - 1), status]
         else:
             remedy = "give one text, or a list with one for each bound"
             statuses = require_list("status", require_order("statuses", status), str, remedy)
-        if len(statuses) != len(y):
+        if len(statuses) != shape[0]:
             raise TrustboError(
-                f"status must be one text or {len(y)}, one for each bound; got {len(statuses)}."
+                f"status must be one text or {shape[0]}, one for each bound; got {len(statuses)}."
             )
 
         ends = np.cumsum(np.nan_to_num(seconds).max(axis=1)).tolist()
-        starts = [0.0, *ends]
-        bounds = []
-        for k in range(len(y)):
-            bound = Bound(
-                cells[k + 1] if cells else NOWHERE,
-                awareness=z[k],
-                contact_rate=y[k],
-                duration=seconds[k],
-                status=statuses[k],
-                t0=starts[k],
-                n_ticks=ticks[k],
-            )
-            bounds.append(bound)
-
-        return cls(cells, tuple(bounds), statuses[-1], names["feature"], names["robot"])
+        return cls(
+            cells,
+            z.values,
+            y.values,
+            seconds,
+            ticks,
+            starts=(0.0, *ends[:-1]),
+            bound_status=tuple(statuses),
+            status=statuses[-1],
+            features=names["feature"],
+            robots=names["robot"],
+        )
 
     def with_awareness(self, awareness: np.ndarray) -> Self:
         """Return the mission with another awareness, shape (bound, robot, feature)."""
         names = {"robot": self.robots, "feature": self.features}
-        read = read_labelled("awareness", awareness, ("bound", "robot", "feature"), names)
-        bounds = zip(self.bounds, read.values, strict=True)
-        return replace(self, bounds=tuple(_with_awareness(bound, z) for bound, z in bounds))
+        return replace(self, awareness=read_labelled("awareness", awareness, _DIMS, names).values)
 
     def in_order(
         self, robots: Sequence[str], features: Sequence[str], unmeasured: Sequence[str]
@@ -361,34 +353,25 @@ class Mission(Summary):
         Raises:
             TrustboError: The mission has other robots or features.
         """
-        names = {"robots": tuple(robots), "features": tuple(features)}
-        if names == {"robots": self.robots, "features": self.features}:
+        if (tuple(robots), tuple(features)) == (self.robots, self.features):
             return self
 
-        lacks = [name for name in features if name in unmeasured and name not in self.features]
-        own = {"robots": self.robots, "features": (*self.features, *lacks)}
-        for what, wanted in names.items():
-            if sorted(own[what]) != sorted(wanted):
-                raise TrustboError(
-                    f"the mission has {what} {getattr(self, what)}, not {wanted}; rename them, or "
-                    "use a workspace with these names."
-                )
-        i = [own["robots"].index(name) for name in robots]
-        m = [own["features"].index(name) for name in features]
+        lacks = {*unmeasured} - {*self.features}
+        own = (*self.features, *lacks.intersection(features))
+        if sorted(robots) != sorted(self.robots) or sorted(features) != sorted(own):
+            raise TrustboError(
+                f"the mission has robots {self.robots} and features {self.features}, not "
+                f"{tuple(robots)} and {tuple(features)}; rename them, or use a workspace with "
+                "these names."
+            )
 
-        bounds = []
-        for bound in self.bounds:
-            z = np.pad(bound.awareness, ((0, 0), (0, len(lacks))), constant_values=np.nan)
-            changes = {"awareness": z[np.ix_(i, m)]}
-            for name in ("contact_rate", "duration", "n_ticks"):
-                changes[name] = getattr(bound, name)[i]
-            if bound.contact is not None:
-                changes["contact"] = bound.contact[:, i]
-            if bound.poses is not None:
-                changes["poses"] = bound.poses[:, [0, *(1 + j for j in i)]]  # the lead is first
-            bounds.append(replace(bound, **changes))
-
-        return replace(self, bounds=tuple(bounds), **names)
+        i = [self.robots.index(name) for name in robots]
+        members = [0, *(1 + j for j in i)]  # the lead is first
+        return replace(
+            self._on_axes(robots, features, np.nan),
+            poses=tuple(None if values is None else values[:, members] for values in self.poses),
+            contact=tuple(None if values is None else values[:, i] for values in self.contact),
+        )
 
     def with_robots(self, robots: Sequence[str]) -> Self:
         """Return the mission with these robots, which include its own; added robots have no rates.
@@ -398,63 +381,49 @@ class Mission(Summary):
         """
         if tuple(robots) == self.robots:
             return self
-        where = [robots.index(name) for name in self.robots]
+        return self._on_axes(robots, self.features, 0.0)
 
-        bounds = []
-        for bound in self.bounds:
-            changes: dict[str, Any] = {"poses": None, "contact": None}
-            for name in ("awareness", "contact_rate", "duration", "n_ticks"):
-                own = getattr(bound, name)
-                fill = 0.0 if name == "awareness" else np.nan
-                changes[name] = np.full((len(robots), *own.shape[1:]), fill)
-                changes[name][where] = own
-            bounds.append(replace(bound, **changes))
+    def _on_axes(self, robots: Sequence[str], features: Sequence[str], unknown: float) -> Self:
+        """Return the mission with these axes, without ticks; awareness it lacks is `unknown`."""
+        i = pd.Index(self.robots).get_indexer(list(robots))  # -1, the last in `wider`, if absent
+        m = pd.Index(self.features).get_indexer(list(features))
+        changes = {}
+        for name in MEASURED:
+            values = getattr(self, name)
+            fill = unknown if name == "awareness" else np.nan
+            margin = [(0, 0), (0, 1), (0, 1)][: values.ndim]
+            wider = np.pad(values, margin, constant_values=fill)[:, i]
+            changes[name] = wider[..., m] if name == "awareness" else wider
 
-        return replace(self, bounds=tuple(bounds), robots=tuple(robots))
+        names = {"robots": tuple(robots), "features": tuple(features)}
+        return replace(self, **names, **changes, poses=(), contact=())
 
     def has_same_data(self, other: "Mission") -> bool:
         """Return whether another mission has the same path, outcome and measurements."""
-        about = ("path", "status", "features", "robots", "scale", "map")
+        about = ("path", "status", "bound_status", "features", "robots", "scale", "map")
         if any(getattr(self, name) != getattr(other, name) for name in about):
             return False
-        if [bound.status for bound in self.bounds] != [bound.status for bound in other.bounds]:
-            return False
-        measured = ("awareness", "contact_rate", "duration", "n_ticks")
         return all(
             np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True)
-            for name in measured
+            for name in MEASURED
         )
-
-    @cached_property
-    def awareness(self) -> np.ndarray:
-        """Measured awareness, shape (bound, robot, feature)."""
-        return self._stacked("awareness")
 
     @property
     def statuses(self) -> list[str]:
         """Status of each bound; that of the last bound is the status of the mission."""
-        return [*(bound.status for bound in self.bounds[:-1]), self.status]
+        return [*self.bound_status[:-1], self.status]
+
+    @property
+    def driven(self) -> tuple[Cell, ...]:
+        """Cells of the path that were entered, start first; empty in a log without a map."""
+        return self.path[: len(self.contact_rate) + 1]
 
     @cached_property
-    def contact_rate(self) -> np.ndarray:
-        """Contact rates, shape (bound, robot)."""
-        return self._stacked("contact_rate")
-
-    @cached_property
-    def duration(self) -> np.ndarray:
-        """Running times, shape (bound, robot), s."""
-        return self._stacked("duration")
-
-    @cached_property
-    def n_ticks(self) -> np.ndarray:
-        """Ticks, shape (bound, robot); NaN where not recorded."""
-        return self._stacked("n_ticks")
-
-    def _stacked(self, name: str) -> np.ndarray:
-        """Stack an array of the bounds; cached, because every refit reads all missions."""
-        array = np.stack([getattr(bound, name) for bound in self.bounds])
-        array.flags.writeable = False
-        return array
+    def bounds(self) -> tuple[Bound, ...]:
+        """Bounds that were run, whose arrays are views of those of the mission."""
+        cells = self.driven[1:] or (NOWHERE,) * len(self.contact_rate)
+        columns = (getattr(self, name) for name in _COLUMNS)
+        return tuple(Bound(*values) for values in zip(cells, *columns, strict=True))
 
 
 def levels_of(scale: object) -> int:
@@ -501,61 +470,29 @@ def default_features(n_features: int) -> tuple[str, ...]:
     return (*FEATURES, *(f"z{m + 1}" for m in range(2, n_features)))[:n_features]
 
 
-def require_shares(rate: np.ndarray, ticks: np.ndarray) -> np.ndarray:
-    """Return ticks, NaN where no tick and no rate was counted.
+def require_shares(rate: np.ndarray, ticks: np.ndarray, where: str = "a bound") -> np.ndarray:
+    """Return ticks, NaN where no tick and no rate was counted; `where` is for messages.
 
     Raises TrustboError for ticks that are not whole and rates that are not multiples of 1 / ticks.
     """
     if ticks.shape != rate.shape:
-        raise TrustboError(f"n_ticks of a bound must be {rate.shape}; got shape {ticks.shape}.")
+        raise TrustboError(f"n_ticks of {where} must be {rate.shape}; got shape {ticks.shape}.")
 
     ticks = np.where((ticks == 0.0) & np.isnan(rate), np.nan, ticks)
     is_whole = np.isfinite(ticks) & (ticks == np.round(ticks))
     is_bad = ~np.isnan(ticks) & ~(is_whole & (ticks >= 1.0))
     if is_bad.any():
-        i = np.flatnonzero(is_bad)[0]
-        raise TrustboError(f"n_ticks[{i}] = {ticks[i]:g} must be a whole number of ticks.")
+        raise TrustboError(
+            f"n_ticks of {where}: {_first(is_bad, ticks)} must be a whole number of ticks."
+        )
 
     off = np.abs(rate * ticks - np.round(rate * ticks)) > SHARE_TOLERANCE * ticks
     if off.any():
-        i = np.flatnonzero(off)[0]
         raise TrustboError(
-            f"contact_rate[{i}] = {rate[i]:g} is not a multiple of 1 / {ticks[i]:g} (n_ticks); "
-            "give all decimals, or leave n_ticks out."
+            f"contact_rate of {where}: {_first(off, rate)} is not a multiple of "
+            f"1 / {ticks[off][0]:g} (n_ticks); give all decimals, or leave n_ticks out."
         )
     return ticks
-
-
-def _with_awareness(bound: Bound, awareness: np.ndarray) -> Bound:
-    """Return a bound with another awareness; both share the ticks, which take most memory."""
-    changed = replace(bound, awareness=awareness, poses=None, contact=None)
-    object.__setattr__(changed, "poses", bound.poses)
-    object.__setattr__(changed, "contact", bound.contact)
-    return changed
-
-
-def _require_recorded(n_robots: int, poses: Any, contact: Any) -> None:
-    """Raise TrustboError unless poses and contact of a bound have the same ticks and robots."""
-    shapes = {"poses": (1 + n_robots, 3), "contact": (n_robots,)}
-    n_ticks = set()
-    for name, values in (("poses", poses), ("contact", contact)):
-        if values is None:
-            continue
-        shape = np.shape(values)
-        if not shape or shape[1:] != shapes[name]:
-            raise TrustboError(f"{name} of a bound must be (tick, *{shapes[name]}); got {shape}.")
-        n_ticks.add(shape[0])
-
-    if len(n_ticks) > 1:
-        raise TrustboError(
-            f"poses of a bound have {len(poses)} ticks, but contact has {len(contact)}; give both "
-            "at the same times."
-        )
-    if contact is not None and not np.isin(contact, (0, 1)).all():
-        raise TrustboError(
-            "contact of a bound must be True or False at each tick; give contact=None if it was "
-            "not measured at some ticks, and the contact_rate of the others."
-        )
 
 
 def require_unit_interval(what: str, values: np.ndarray) -> np.ndarray:
@@ -563,46 +500,90 @@ def require_unit_interval(what: str, values: np.ndarray) -> np.ndarray:
     values = without_rounding(values)
     bad = (values < 0.0) | (values > 1.0)
     if bad.any():
-        index = ", ".join(str(i) for i in np.argwhere(bad)[0])
         scaled = "percent? divide by 100; rating from 1 to n? (rating - 1) / (n - 1)"
         hint = f" ({scaled})" if np.nanmin(values) >= 0.0 else ""
-        raise TrustboError(f"{what}: [{index}] = {values[bad][0]:g} is outside [0, 1]{hint}.")
+        raise TrustboError(f"{what}: {_first(bad, values)} is outside [0, 1]{hint}.")
     return values
 
 
-def _require_counted(path: Iterable[Cell]) -> None:
-    """Raise TrustboError for negative rows or columns, which would be read from the other end."""
-    for cell in path:
-        if min(cell) < 0:
-            raise TrustboError(
-                f"the path enters {tuple(cell)}, but rows and columns are counted from 0; give "
-                "path=None for a log without a map."
-            )
+def _first(is_bad: np.ndarray, values: np.ndarray) -> str:
+    """Write the index of the first bad value, and the value."""
+    index = np.argwhere(is_bad)[0]
+    return f"[{', '.join(map(str, index))}] = {values[tuple(index)]:g}"
 
 
-def _unnamed(what: str, values: Any) -> np.ndarray:
-    """Copy an array of a bound, whose robots and features have no names."""
-    dims = ("robot", "feature") if what == "awareness" else ("robot",)
-    return np.array(read_labelled(f"{what} of a bound", values, dims, dict.fromkeys(dims)).values)
+def _require_axes(awareness: np.ndarray, *others: np.ndarray) -> None:
+    """Raise TrustboError unless the other arrays have the bounds and robots of awareness."""
+    shapes = {values.shape for values in others}
+    if awareness.ndim != 3 or not awareness.size or shapes != {awareness.shape[:2]}:
+        texts = " and ".join(map(str, (awareness.shape, *shapes)))
+        raise TrustboError(
+            "awareness must be (bound, robot, feature) and contact_rate (bound, robot), with at "
+            f"least one bound; got {texts}. If you have no features, give one feature that is 0."
+        )
 
 
-def _read(
-    names: dict[str, tuple[str, ...]], what: str, values: Any, dims: Sequence[str]
-) -> np.ndarray:
-    """Read an array in the order of `names`; names that are not known come from its labels."""
-    coords = {dim: names[dim] for dim in dims if dim in names}
-    read = read_labelled(what, values, dims, coords)
-    names |= read.coords
-    return read.values
+def _checked(
+    where: str,
+    mapped: bool,
+    awareness: np.ndarray,
+    contact_rate: np.ndarray,
+    duration: np.ndarray,
+    n_ticks: np.ndarray,
+) -> tuple[np.ndarray, ...]:
+    """Return measurements without the errors of rounding, and NaN for ticks of nothing.
+
+    The arrays are of one bound or of several, named `where` in messages.
+    """
+    rates = require_unit_interval(f"contact_rate of {where}", contact_rate)
+    if mapped:
+        awareness = require_unit_interval(f"awareness of {where}", awareness)
+    elif np.isinf(awareness).any():
+        raise TrustboError(f"awareness of {where} must be finite, or NaN where not measured.")
+
+    is_bad = (duration <= 0.0) | np.isinf(duration)
+    if is_bad.any():
+        raise TrustboError(
+            f"duration of {where}: {_first(is_bad, duration)} s must be positive and finite."
+        )
+    return awareness, rates, duration, require_shares(rates, n_ticks, where)
+
+
+def _require_recorded(where: str, n_robots: int, poses: Any, contact: Any) -> None:
+    """Raise TrustboError unless poses and contact of a bound have the same ticks and robots."""
+    axes = {"poses": (1 + n_robots, 3), "contact": (n_robots,)}
+    given = {"poses": poses, "contact": contact}
+    shapes = {name: np.shape(values) for name, values in given.items() if values is not None}
+    for name, shape in shapes.items():
+        if shape[1:] != axes[name]:
+            raise TrustboError(f"{name} of {where} must be (tick, *{axes[name]}); got {shape}.")
+
+    if len({shape[0] for shape in shapes.values()}) > 1:
+        raise TrustboError(
+            f"poses of {where} have {len(poses)} ticks, but contact has {len(contact)}; give both "
+            "at the same times."
+        )
+    if contact is not None and not np.isin(contact, (0, 1)).all():
+        raise TrustboError(
+            f"contact of {where} must be True or False at each tick; give contact=None if it was "
+            "not measured at some ticks, and the contact_rate of the others."
+        )
+
+
+def _own(values: Any, dtype: type) -> Any:
+    """Return a read-only copy; None, and an array that is such a copy, as they are."""
+    if values is None or (values.flags.owndata and not values.flags.writeable):
+        return values
+    copied = np.array(values, dtype)
+    copied.flags.writeable = False
+    return copied
 
 
 def _per_robot(what: str, given: Any, robots: Sequence[str], shape: tuple[int, ...]) -> np.ndarray:
     """Read one number, or values (bound,) or (bound, robot), as an array (bound, robot)."""
     if given is None:
         return np.full(shape, np.nan)
-    dims = ("bound", "robot")
-    coords = {"robot": robots}
-    values = read_labelled(what, given, dims, coords, partial=True).values
+    values = read_labelled(what, given, _DIMS[:2], {"robot": robots}, partial=True).values
     try:
         return np.broadcast_to(values[:, None] if values.ndim == 1 else values, shape)
     except ValueError:

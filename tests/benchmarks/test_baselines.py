@@ -1,6 +1,5 @@
 """Baselines of the benchmark: each against enumeration, a hand formula or a closed form."""
 
-import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +8,7 @@ from baselines import line_of_sight, oracle, paths, residual_process, running_me
 from enumeration import paths_of
 
 import trustbo as tb
-from trustbo.data import Bound, Mission
+from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.planning import Planner
 from trustbo.simulation import Degradation, KinematicSimulator, Truth
@@ -37,17 +36,10 @@ def planner(workspace):
 
 def mission_of(planner, path, rates, n_driven=None):
     """Mission with these rates of its bounds, the same of all robots."""
-    n_robots, n_features = 3, len(planner.workspace.features)
-    bounds = tuple(
-        Bound(
-            cell, np.full((n_robots, n_features), 0.5), np.full(n_robots, rate), np.ones(n_robots)
-        )
-        for cell, rate in zip(path[1:], rates, strict=True)
-    )[:n_driven]
-    if n_driven is None:
-        return Mission(path, bounds)
-    bounds = (*bounds[:-1], dataclasses.replace(bounds[-1], status="stuck"))
-    return Mission(path, bounds, status="stuck")
+    rates = np.repeat(np.asarray(rates, float)[:n_driven, None], 3, axis=1)
+    z = np.full((*rates.shape, len(planner.workspace.features)), 0.5)
+    status = "ok" if n_driven is None else "stuck"
+    return Mission.from_arrays(path, z, rates, np.ones(len(rates)), status)
 
 
 def rates_along(table, path):

@@ -92,9 +92,7 @@ def test_posterior_is_that_of_all_missions_with_the_awareness_of_the_map(workspa
     for j in range(2):
         seed, before = campaign.state.seed_of("fit"), campaign.state.posterior
         campaign.tell(ModelSimulator(lower).run(campaign.ask().path, seed=j))
-    expected = [replace(m, bounds=tuple(
-        replace(b, awareness=z) for b, z in zip(m.bounds, workspace.along(m.path), strict=True)
-    )) for m in campaign.missions]  # fmt: skip
+    expected = [replace(m, awareness=workspace.along(m.path)) for m in campaign.missions]
     again = fit(expected, PooledTrust(), seed=seed, draws=300, start=before)
     for group in ("posterior", "log_likelihood"):
         for name, values in again[group].data_vars.items():
@@ -348,8 +346,7 @@ def test_contact_lost_without_gaps_is_that_of_the_mean_rate_to_the_last_digit(wo
 def test_a_failure_without_rates_counts_until_a_user_excludes_it(workspace):
     campaign = begin(workspace)
     told = rates(workspace, DIAGONAL, fail_at=2)
-    bounds = [replace(b, contact_rate=np.full(3, np.nan)) for b in told.bounds]
-    told = replace(told, bounds=tuple(bounds))
+    told = replace(told, contact_rate=np.full(told.contact_rate.shape, np.nan))
     with pytest.warns(UserWarning, match="excluded"):
         campaign.tell(told)
     with pytest.raises(tb.TrustboError, match="recorded already"):

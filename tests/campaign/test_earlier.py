@@ -252,10 +252,7 @@ def test_an_unknown_robot_informs_shared_parameters(first):
 def only(mission, robot):
     """A mission in which only one robot's rates are measured."""
     others = np.array([name != robot for name in mission.robots])
-    bounds = []
-    for bound in mission.bounds:
-        bounds.append(replace(bound, contact_rate=np.where(others, np.nan, bound.contact_rate)))
-    return replace(mission, bounds=tuple(bounds))
+    return replace(mission, contact_rate=np.where(others, np.nan, mission.contact_rate))
 
 
 @pytest.mark.parametrize(

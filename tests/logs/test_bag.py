@@ -24,8 +24,9 @@ def workspace():
 def driven(workspace):
     simulator = tb.simulation.KinematicSimulator(workspace)
     first = simulator.run([(2, 0), (1, 1), (0, 2)], seed=0)
-    bound = replace(first.bounds[0], status="aborted")
-    return [first, replace(first, bounds=(bound,), status="aborted")]
+    names = ("awareness", "contact_rate", "duration", "n_ticks", "starts", "poses", "contact")
+    of_bound = {name: getattr(first, name)[:1] for name in names}
+    return [first, replace(first, **of_bound, bound_status=("aborted",), status="aborted")]
 
 
 @pytest.mark.parametrize("kind", ["log.bag", "sqlite3", "mcap"])

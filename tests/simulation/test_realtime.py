@@ -110,7 +110,7 @@ def test_a_bound_without_poses_and_a_workspace_without_its_features_are_refused(
 ):
     robots = RealtimeAwareness(simulator, missions)
     one = missions[0]
-    without = replace(one, bounds=(replace(one.bounds[0], poses=None), *one.bounds[1:]))
+    without = replace(one, poses=(None, *one.poses[1:]))
     with pytest.raises(TrustboError, match="poses"):
         robots.measured(without)
     other = Workspace.from_terrain(hillside(), (3, 3), features={"slope": ["slope"]})

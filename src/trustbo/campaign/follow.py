@@ -9,9 +9,15 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.replan import trust_filter
-from trustbo.data import Bound, Cell, Mission, path_text
+from trustbo.data import MEASURED, STATUSES, Bound, Cell, Mission, path_text
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_finite, require_kind, require_pair
+from trustbo.errors import (
+    TrustboError,
+    require_choice,
+    require_finite,
+    require_kind,
+    require_pair,
+)
 from trustbo.inference.filter import TrustForecast, TrustState
 from trustbo.planning import Plan
 from trustbo.workspace.grid import Location
@@ -146,12 +152,13 @@ class Follower(Summary):
                 or `t` is before the previous time.
         """
         self._require(running=True, t=t)
+        require_choice("status", status, STATUSES)
         unknown = np.full((self._counts.shape[1], len(self._workspace.features)), np.nan)
         seconds = np.full(len(unknown), t - self._begun)
         since = self._begun - self._started
 
         rates, n_ticks = self._measured
-        bound = Bound(self.rest[0], unknown, rates, seconds, status, since, n_ticks=n_ticks)
+        bound = Bound(self.rest[0], unknown, rates, seconds, n_ticks, status, since)
         self.bounds = (*self.bounds, bound)
         self.running = False
         self._is_over = status != "ok"
@@ -220,7 +227,15 @@ class Follower(Summary):
         workspace = self._workspace
         if status == "ok" and self.rest != (self._goal,):
             status = "aborted"
-        return Mission(self.path, self.bounds, status, workspace.features, workspace.team.names)
+        return Mission(
+            self.path,
+            *(np.stack([getattr(bound, name) for bound in self.bounds]) for name in MEASURED),
+            bound_status=tuple(bound.status for bound in self.bounds),
+            starts=tuple(bound.t0 for bound in self.bounds),
+            status=status,
+            features=workspace.features,
+            robots=workspace.team.names,
+        )
 
     def _count(self, t: float, counts: np.ndarray, bound: tuple[Cell, Cell]) -> None:
         """Store tick counts (2, robot) of a bound, and the trust as if the bound ended now."""

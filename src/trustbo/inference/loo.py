@@ -343,11 +343,7 @@ def _of_function(posterior: xr.DataTree, model: FunctionModel) -> LeftOut:
 
 def _unmeasured(mission: Mission) -> Mission:
     """Return a mission without its contact rates, but with data of the same shape."""
-    bounds = [
-        replace(bound, contact_rate=np.full_like(bound.contact_rate, np.nan))
-        for bound in mission.bounds
-    ]
-    return replace(mission, bounds=tuple(bounds))
+    return replace(mission, contact_rate=np.full_like(mission.contact_rate, np.nan))
 
 
 # --- a user's own MCMC ---

@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.data import NOWHERE, Bound, Mission
+from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, hash_of, interpreting, read_file, to_path, write_file
 from trustbo.stacking import require_same_team
 
 _ARRAYS = {"awareness": "1", "contact_rate": "1", "duration": "s", "n_ticks": "1"}
 """Arrays of a bound, (robot,) or (robot, feature), and their units."""
+_TEXTS = ("status", "scale", "map")
+"""Texts of a mission."""
 _SEAL = b"sha256:"
 """Beginning of the hash that follows the content of a file."""
 _SEAL_LENGTH = len(_SEAL) + 64
@@ -137,32 +139,40 @@ def missions_to_tree(missions: Iterable[Mission]) -> xr.DataTree:
     """
     missions = require_same_team(missions)
     bounds = [bound for mission in missions for bound in mission.bounds]
-    ticks = [_ticks(bound) for bound in bounds]
-    poses, contacts = (np.concatenate(values) for values in zip(*ticks, strict=True))
+    names = {"robot": list(missions[0].robots), "feature": list(missions[0].features)}
+
+    # Ticks of the bounds that have both poses and contact.
+    n_robots = len(names["robot"])
+    recorded = []
+    poses = [np.empty((0, 1 + n_robots, 3))]
+    contacts = [np.empty((0, n_robots), dtype=bool)]
+    for bound in bounds:
+        if bound.poses is None or bound.contact is None:
+            recorded.append(0)
+        else:
+            recorded.append(len(bound.poses))
+            poses.append(bound.poses)
+            contacts.append(bound.contact)
 
     cells = [cell for mission in missions for cell in mission.path]
     variables: dict[str, Any] = {
         "path": (("step", "axis"), np.reshape(cells, (-1, 2)).astype(int)),
         "start": ("bound", [bound.t0 for bound in bounds], {"units": "s"}),
         "bound_status": ("bound", [bound.status for bound in bounds]),
-        "recorded": ("bound", [len(pose) for pose, _ in ticks]),
-        "pose": (("tick", "member", "component"), poses),
-        "contact": (("tick", "robot"), contacts),
+        "recorded": ("bound", recorded),
+        "pose": (("tick", "member", "component"), np.concatenate(poses)),
+        "contact": (("tick", "robot"), np.concatenate(contacts)),
         "n_bounds": ("mission", [len(mission.bounds) for mission in missions]),
         "n_steps": ("mission", [len(mission.path) for mission in missions]),
-        "status": ("mission", [mission.status for mission in missions]),
-        "scale": ("mission", [mission.scale for mission in missions]),
     }
 
     for name, units in _ARRAYS.items():
-        values = np.stack([getattr(bound, name) for bound in bounds])
+        values = np.concatenate([getattr(mission, name) for mission in missions])
         dims = ("bound", "robot", "feature")[: values.ndim]
         variables[name] = (dims, values, {"units": units})
+    for name in _TEXTS:
+        variables[name] = ("mission", [getattr(mission, name) for mission in missions])
 
-    if any(mission.map for mission in missions):
-        variables["map"] = ("mission", [mission.map for mission in missions])
-
-    names = {"robot": list(missions[0].robots), "feature": list(missions[0].features)}
     axes = {"axis": ["row", "col"], "component": ["x", "y", "heading"]}
     return xr.DataTree(xr.Dataset(variables, names | axes))
 
@@ -171,46 +181,30 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
     """Invert `missions_to_tree`; raises LookupError or ValueError for a tree of another form."""
     table = {str(name): array.values for name, array in tree.to_dataset().variables.items()}
 
-    def parts(values: np.ndarray, counts: str) -> list[np.ndarray]:
-        return np.split(values, np.cumsum(table[counts])[:-1])
+    def parts(values: Any, counts: str) -> list[Any]:
+        ends = np.cumsum(table[counts]).tolist()
+        return [values[end - n : end] for end, n in zip(ends, table[counts], strict=True)]
 
-    robots = tuple(map(str, table["robot"]))
-    features = tuple(map(str, table["feature"]))
-    poses = parts(table["pose"], "recorded")
-    contacts = parts(table["contact"], "recorded")
-    paths = parts(table["path"], "n_steps")
-    rows = parts(np.arange(len(poses)), "n_bounds")
+    def ticks(name: str) -> list[tuple[np.ndarray | None, ...]]:
+        of_bounds = [values if len(values) else None for values in parts(table[name], "recorded")]
+        return [tuple(of_mission) for of_mission in parts(of_bounds, "n_bounds")]
 
-    missions = []
-    for j, of_mission in enumerate(rows):
-        path = tuple((int(row), int(col)) for row, col in paths[j])
-        bounds = []
-        entered = path[1:] or [NOWHERE] * len(of_mission)
-        for cell, i in zip(entered, of_mission, strict=False):  # planned cells may follow
-            has_ticks = len(poses[i]) > 0
-            bound = Bound(
-                cell,
-                awareness=table["awareness"][i],
-                contact_rate=table["contact_rate"][i],
-                duration=table["duration"][i],
-                n_ticks=table["n_ticks"][i],
-                status=str(table["bound_status"][i]),
-                t0=float(table["start"][i]),
-                poses=poses[i] if has_ticks else None,
-                contact=contacts[i].astype(bool) if has_ticks else None,
-            )
-            bounds.append(bound)
-
-        status = str(table["status"][j])
-        scale = str(table["scale"][j])
-        on = str(table["map"][j]) if "map" in table else ""
-        missions.append(Mission(path, tuple(bounds), status, features, robots, scale, on))
-    return missions
-
-
-def _ticks(bound: Bound) -> tuple[np.ndarray, np.ndarray]:
-    """Return poses (tick, member, component) and contacts (tick, robot); empty if one is None."""
-    if bound.poses is None or bound.contact is None:
-        n_robots = len(bound.contact_rate)
-        return np.empty((0, 1 + n_robots, 3)), np.empty((0, n_robots), dtype=bool)
-    return bound.poses, bound.contact
+    columns = {name: parts(table[name], "n_bounds") for name in _ARRAYS}
+    columns |= {
+        "path": parts(table["path"].tolist(), "n_steps"),
+        "starts": parts(table["start"].tolist(), "n_bounds"),
+        "bound_status": parts(table["bound_status"].tolist(), "n_bounds"),
+        "poses": ticks("pose"),
+        "contact": ticks("contact"),
+    }
+    table.setdefault("map", np.full(len(table["status"]), ""))  # not in files of version 0.5
+    columns |= {name: table[name].tolist() for name in _TEXTS}
+    names = {name: tuple(table[name].tolist()) for name in ("robot", "feature")}
+    return [
+        Mission(
+            robots=names["robot"],
+            features=names["feature"],
+            **{name: of_missions[j] for name, of_missions in columns.items()},
+        )
+        for j in range(len(table["n_bounds"]))
+    ]

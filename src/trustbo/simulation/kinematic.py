@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Bound, Cell, Mission
+from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_list, require_positive, require_whole
 from trustbo.simulation.events import Event
 from trustbo.simulation.motion import drive_together
@@ -163,32 +163,27 @@ class KinematicSimulator(DescribedSimulator):
         world = self.world(mission)
 
         state = self.standing(*cells[:2])
-        time = 0.0
-        bounds: list[Bound] = []
+        driven = []
         for k, (cell, after) in enumerate(zip(cells[1:], [*cells[2:], None], strict=True), start=1):
             rng = np.random.default_rng([seed, k])
             [(drive, contact, state)] = self.outcomes(world, state, k, cell, [after], rng)
-            n_ticks = np.full(self.team.n_robots, len(contact))
-            bound = Bound(
-                cell,
-                awareness[k - 1],
-                contact_rate=contact.mean(0),
-                duration=n_ticks * self.tick,
-                status=drive.status,
-                t0=time,
-                poses=drive.poses,
-                contact=contact,
-                n_ticks=n_ticks,
-            )
-            bounds.append(bound)
-
-            time = bound.t1
+            driven.append((drive.status, drive.poses, contact))
             if drive.status != "ok":
                 break
 
-        features = self.workspace.features
-        robots = self.workspace.team.names
-        return Mission(tuple(cells), tuple(bounds), bounds[-1].status, features, robots)
+        statuses, poses, contacts = zip(*driven, strict=True)
+        n_ticks = np.array([len(contact) for contact in contacts])
+        measured = Mission.from_arrays(
+            cells,
+            awareness[: len(driven)],
+            [contact.mean(0) for contact in contacts],
+            n_ticks * self.tick,
+            statuses[-1],
+            n_ticks=n_ticks,
+            features=self.workspace.features,
+            robots=self.workspace.team.names,
+        )
+        return dataclasses.replace(measured, poses=poses, contact=contacts)
 
     def standing(self, cell: Cell, next_cell: Cell | None) -> State:
         """Return the state of a team that stands at the stop and the posts of a cell."""
