@@ -125,24 +125,20 @@ def in_order(what: str, group: xr.Dataset, names: Mapping[str, Sequence[Any] | N
     for axis, index in group.indexes.items():
         if axis not in names:
             continue
-        wanted = names[str(axis)]
-        ranks = index.to_numpy() if wanted is None else _ranks(what, str(axis), index, wanted)
+        ranks = index.to_numpy()
+        if names[str(axis)] is not None:
+            labels = [str(label) for label in index]
+            known = [str(name) for name in names[str(axis)] or ()]
+            ranks = pd.Index(known).get_indexer(labels)  # pyright: ignore[reportArgumentType]
+            if len(set(labels)) < len(labels) or (ranks < 0).any():
+                kind = str(axis).removesuffix("_")  # of the second axis of a matrix
+                raise TrustboError(
+                    f"{what} has the {kind}s {', '.join(labels)}, not {', '.join(known)}; rename "
+                    "them, or leave out those that are not among these."
+                )
         if (ranks[1:] < ranks[:-1]).any():
             order[axis] = np.argsort(ranks, kind="stable")
     return group.isel(order) if order else group
-
-
-def _ranks(what: str, axis: str, index: pd.Index, names: Sequence[Any]) -> np.ndarray:
-    """Return the position of each label of an axis among its names."""
-    labels = [str(label) for label in index]
-    known = [str(name) for name in names]
-    if len(set(labels)) < len(labels) or not set(labels) <= set(known):
-        kind = axis.removesuffix("_")  # of the second axis of a matrix
-        raise TrustboError(
-            f"{what} has the {kind}s {', '.join(labels)}, not {', '.join(known)}; rename them, or "
-            "leave out those that are not among these."
-        )
-    return np.array([known.index(label) for label in labels], dtype=int)
 
 
 def as_array(what: str, values: ArrayLike) -> np.ndarray:
@@ -263,7 +259,7 @@ def _as_dataarray(
     coords = {}
     for dim, index in axes.items():
         if dim in _FIRST and index.name != dim:
-            _require_in_order(what, dim, index)
+            _by_number(what, dim, index.to_numpy(), in_order=True)
         elif not (isinstance(index, pd.RangeIndex) and index.step > 0):
             coords[dim] = index.to_numpy()
     return xr.DataArray(_with_nan(values), coords, tuple(axes))
@@ -320,73 +316,60 @@ def _axes_of(
 
 def _by_name(what: str, dim: str, labels: list[Any], names: Names) -> tuple[list[int], Names]:
     """Return the position of each name among the labels, and the names; () if labels count."""
-    is_text = [isinstance(label, str) for label in labels]
-    is_whole = [isinstance(label, Integral) and not isinstance(label, bool) for label in labels]
     texts = [composed(str(label)) for label in labels]
-
-    if len(set(texts)) == len(texts) and set(texts) == set(names):
+    if sorted(texts) == sorted(names):
         return [texts.index(name) for name in names], names
 
     # Whole numbers in order say no more than the position.
-    counts = [list(range(first, first + len(labels))) for first in (0, 1)]
-    if dim in _CHOSEN and all(is_whole) and labels in counts:
-        return list(range(len(labels))), ()
+    position = list(range(len(labels)))
+    whole = [isinstance(label, Integral) and not isinstance(label, bool) for label in labels]
+    if dim in _CHOSEN and all(whole) and labels in (position, [k + 1 for k in position]):
+        return position, ()
 
-    if not all(text or whole for text, whole in zip(is_text, is_whole, strict=True)):
+    if not all(
+        isinstance(label, str) or is_whole for label, is_whole in zip(labels, whole, strict=True)
+    ):
         raise TrustboError(f"{what} has the {dim} labels {one_line(labels)}; give names.")
     if names:
         raise TrustboError(
             f"{what} has the {dim}s {one_line(texts)}, not {one_line(list(names))}; rename them."
         )
-    return list(range(len(labels))), as_names(f"the {dim}s of {what}", texts)
+    return position, as_names(f"the {dim}s of {what}", texts)
 
 
-def _by_number(what: str, dim: str, labels: np.ndarray) -> list[int]:
-    """Return the position of each number, from the first to the last, if none is missing."""
-    if labels.dtype.kind in "iuf":
-        order = np.argsort(labels, kind="stable")
-        if any(_counts(labels[order], first) for first in _FIRST[dim]):
-            return order.tolist()
-    if _are_times(dim, labels):
-        return list(range(len(labels)))
-    raise _unnumbered(what, dim, labels, f"drop_vars({dim!r})")
+def _by_number(what: str, dim: str, labels: np.ndarray, *, in_order: bool = False) -> np.ndarray:
+    """Return the position of each number, from the first to the last, if none is missing.
 
-
-def _require_in_order(what: str, dim: str, index: pd.Index) -> None:
-    """Raise TrustboError unless an index without a name agrees with the position of each row.
-
-    After a sort by another column, nobody can tell whether the rows or the index are in order.
+    With `in_order`, the numbers must be in order: those of an index without a name, for which
+    nobody can tell after a sort by another column whether the rows or the index are in order.
+    Increasing times of bounds also are in order.
     """
-    labels = index.to_numpy()
     firsts = _FIRST[dim]
-    if dim == "bound":  # rows cut from the table of several missions
-        firsts = (*firsts, *labels[:1])
-    if not (any(_counts(labels, first) for first in firsts) or _are_times(dim, labels)):
-        raise _unnumbered(what, dim, labels, "reset_index(drop=True)")
+    remedy = f"drop_vars({dim!r})"
+    order = np.arange(len(labels))
+    if in_order:
+        remedy = "reset_index(drop=True)"
+        if dim == "bound":  # rows cut from the table of several missions
+            firsts = (*firsts, *labels[:1])
+    elif labels.dtype.kind in "iuf":
+        order = np.argsort(labels, kind="stable")
 
-
-def _counts(labels: np.ndarray, first: Any) -> bool:
-    """Return whether labels are the whole numbers from `first`, in order."""
-    if not len(labels):
-        return True
-    whole = labels.dtype.kind in "iuf" and float(first).is_integer()
-    return bool(whole and (labels == first + np.arange(len(labels))).all())
-
-
-def _are_times(dim: str, labels: np.ndarray) -> bool:
-    """Return whether labels are increasing times of bounds rather than numbers of bounds."""
-    if dim != "bound" or labels.dtype.kind not in "fmM":
-        return False
-    if labels.dtype.kind == "f" and (labels == np.round(labels)).all():
-        return False
-    return bool((labels[1:] > labels[:-1]).all())
-
-
-def _unnumbered(what: str, dim: str, labels: np.ndarray, remedy: str) -> TrustboError:
-    """Return the error for labels along an axis whose labels are numbers."""
+    ordered = labels[order]
+    is_number = labels.dtype.kind in "iuf"
+    counts = any(
+        is_number and (ordered == first + np.arange(len(labels))).all() for first in firsts
+    )
+    if counts or not len(labels) or (dim == "bound" and _are_times(labels)):
+        return order
     starts = " or ".join(str(first) for first in _FIRST[dim])
-    return TrustboError(
+    raise TrustboError(
         f"{what} has the {dim} labels {one_line(labels.tolist())}; they must be the numbers from "
         f"{starts} without gaps, with NaN where nothing was measured. If the values are in order, "
         f"use {remedy}."
     )
+
+
+def _are_times(labels: np.ndarray) -> bool:
+    """Return whether labels are increasing times of bounds rather than numbers of bounds."""
+    is_whole = labels.dtype.kind == "f" and (labels == np.round(labels)).all()
+    return bool(labels.dtype.kind in "fmM" and not is_whole and (labels[1:] > labels[:-1]).all())
