@@ -16,7 +16,7 @@ from matplotlib import patheffects
 import trustbo as tb
 from trustbo import plots
 from trustbo.plots.explorer import _layers
-from trustbo.plots.maps import contour_interval, contours, draw_path, extent_of, trust_limits
+from trustbo.plots.maps import draw_contours, draw_path, extent_of, limits_of
 from trustbo.report import bounds_of, facts_of, write_report
 
 EFFECTS = pd.DataFrame(
@@ -192,19 +192,30 @@ def test_a_path_goes_through_the_centres_of_its_cells(result):
     np.testing.assert_allclose(ax.lines[0].get_xydata(), [(10.0, 10.0), (30.0, 30.0)])
 
 
-def test_contour_lines_of_a_plane_are_level():
+@pytest.mark.parametrize(("relief", "interval"), [(0.0, None), (12.0, 1), (24.0, 2), (60.0, 5)])
+def test_contour_lines_of_a_plane_are_level_and_at_round_heights(relief, interval):
     terrain = tb.terrain.synthetic_terrain((80.0, 60.0), 2.0, seed=0, relief=4.0)
-    terrain["dem"] = terrain["dem"] * 0.0 + np.arange(terrain.sizes["y"])[:, None]
+    y = terrain["y"].values
+    terrain["dem"] = terrain["dem"] * 0.0 + relief * (y - y.min())[:, None] / np.ptp(y)
     terrain["dsm"] = terrain["dem"]
-    lines = contours(tb.Workspace.from_terrain(terrain, (4, 3)))
-    assert len(lines) > 3
-    assert all(np.ptp(line[:, 1]) < 1e-6 for line in lines)
-    assert [contour_interval(relief) for relief in (0.0, 12.0, 60.0, 240.0)] == [None, 1, 5, 20]
+
+    _, ax = plt.subplots()
+    draw_contours(ax, tb.Workspace.from_terrain(terrain, (4, 3)), "black", 1.0)
+    if interval is None:
+        assert not ax.collections
+        return
+
+    (lines,) = ax.collections
+    heights = [path.vertices[:, 1] for path in lines.get_paths() if len(path.vertices)]
+    assert len(heights) > 3
+    assert all(np.ptp(height) < 1e-6 for height in heights)
+    np.testing.assert_allclose(np.diff(lines.levels), interval)
+    np.testing.assert_allclose(lines.levels % interval, 0.0)
 
 
 @pytest.mark.parametrize(("high", "limit"), [(0.9, 0.9), (1.05, 1.0), (4.0, 4.0)])
 def test_scales_of_trust_end_at_1_unless_trust_is_a_logit(high, limit):
-    assert trust_limits(np.array([0.5, high] * 50)) == (0.5, limit)
+    assert limits_of(np.array([0.5, high] * 50), is_trust=True) == (0.5, limit)
 
 
 @pytest.mark.parametrize("name", ["trust_mean", "trust_sd", "cost", "path_probability"])

@@ -14,21 +14,21 @@ from trustbo.inference.draws import as_fitted
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.plots.style import (
     GREY,
-    MARKERS,
     ROBOTS,
     accent,
     add_legend,
     as_text,
     background,
+    handles_of,
     ink,
     is_broad,
     panels,
+    robot_looks,
     styled,
 )
 
 _LABELS = {
     "contact_lost": "contact lost\n(bounds)",
-    "contact_rate": "contact rate",
     "objective": "objective\n(predicted)",
     "regret": "regret (%)",
 }
@@ -70,35 +70,33 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
         x = np.arange(1, len(given.trust) + 1)
         middle = given.trust
         bands = given.bands
-        rates = np.full(given.trust.shape, np.nan)
+        rates = np.full(middle.shape, np.nan)
         robots = given.workspace.team.names
     else:
         x, middle, bands, rates, robots = _latent_trust(given, mission)
 
     axes = panels(len(robots), ax, (2.4, 1.9), sharex=True, sharey=True)
+    style: dict[str, Any] = {"color": accent(), "linewidth": 0.0}
     for i, (panel, name) in enumerate(zip(axes, robots, strict=True)):
-        colour = accent()
         low, lower, upper, high = bands[..., i]
-        style: dict[str, Any] = {"color": colour, "linewidth": 0.0}
         panel.fill_between(x, low, high, alpha=0.25, label="90 %", **style)
         panel.fill_between(x, lower, upper, alpha=0.5, label="50 %", **style)
         marker = "." if len(x) == 1 else ""  # a line of one point is invisible
-        panel.plot(x, middle[:, i], color=colour, marker=marker, label="trust")
+        panel.plot(x, middle[:, i], color=accent(), marker=marker, label="trust")
         if np.isfinite(rates[:, i]).any():
             panel.plot(x, rates[:, i], "o", color=ink(), markersize=3.5, label="contact rate")
-        panel.set_title(as_text(name))
-        panel.set_xlabel("bound")
+        panel.set(title=as_text(name), xlabel="bound")
         n_ticks = "auto" if is_broad(panel) else _FEW_TICKS
         panel.xaxis.set_major_locator(MaxNLocator(n_ticks, integer=True))
 
-    limits = np.array([panel.get_ylim() for panel in axes])
+    low, high = np.transpose([panel.get_ylim() for panel in axes])
     for panel in axes:  # the user's axes may have scales of their own
-        panel.set_ylim(limits[:, 0].min(), limits[:, 1].max())
+        panel.set_ylim(low.min(), high.max())
         if panel.get_subplotspec() is not None:
             panel.label_outer()
 
     axes[0].set_ylabel("trust, contact rate")
-    add_legend(axes, axes[0].get_legend_handles_labels()[0])
+    add_legend(axes, handles_of(axes[0]))
     return axes
 
 
@@ -139,39 +137,35 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
         ax: Axes to draw on, one for each variable; by default a new figure.
 
     Returns:
-        Axes, shape (variable,): contact lost (or the contact rate), the objective unless it shares
-        the first axes, and regret.
+        Axes, shape (variable,): contact lost, the objective unless it shares the first axes, and
+        regret.
     """
+    predicts_lost = history.attrs.get("objective") == _LOST
     names = [name for name in _LABELS if name in history]
-    if "contact_lost" in names:
-        names.remove("contact_rate")
-    predicted = None
-    if "contact_lost" in names and history.attrs.get("objective") == _LOST:
+    if predicts_lost:
         names.remove("objective")
-        predicted = -history["objective"].values
+
     mission = history["iteration"].values
     changed = history["path_changed"].values.astype(bool) | (mission == 1)
     failed = history["status"].values.astype(str) != "ok"
+    prefix = "measured, " if predicts_lost else ""
+    dots = (changed, accent(), f"{prefix}new path"), (~changed, "none", f"{prefix}same path")
 
     height = 2.2 if len(names) == 1 else 1.6  # in inches
     axes = panels(len(names), ax, (4.6, height), columns=1, sharex=True)
     for panel, name in zip(axes, names, strict=True):
         values = history[name].values
         panel.plot(mission, values, color=accent(), linewidth=1.0)
-        if name == "contact_lost" and predicted is not None:
-            style: dict[str, Any] = {"color": ink(), "linestyle": ":", "linewidth": 1.2}
-            panel.plot(mission, predicted, marker=".", label="predicted by the plan", **style)
-
-        prefix = "" if predicted is None else "measured, "
-        new = f"{prefix}new path"
-        same = f"{prefix}same path"
-        for which, fill, label in ((changed, accent(), new), (~changed, "none", same)):
-            dots = {"markerfacecolor": fill, "markeredgecolor": accent(), "label": label}
-            panel.plot(mission[which], values[which], "o", markersize=5.5, **dots)
-
+        if name == "contact_lost" and predicts_lost:
+            style = {"color": ink(), "linewidth": 1.2, "label": "predicted by the plan"}
+            panel.plot(mission, -history["objective"].values, ".:", **style)
+        for which, fill, label in dots:
+            style = {"color": accent(), "markerfacecolor": fill, "label": label}
+            panel.plot(mission[which], values[which], "o", markersize=5.5, **style)
         if failed.any():
             cross = {"color": ROBOTS[1], "markersize": 9.0, "label": "goal not reached"}
             panel.plot(mission[failed], values[failed], "x", **cross)
+
         panel.set_ylabel(_LABELS[name])
         panel.margins(y=_MARGIN)
         if name == "contact_lost":
@@ -179,7 +173,7 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
 
     axes[-1].set_xlabel("mission")
     axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
-    add_legend(axes, axes[0].get_legend_handles_labels()[0])
+    add_legend(axes, handles_of(axes[0]))
     return axes
 
 
@@ -216,20 +210,19 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     axes = panels(1, ax, (5.0, 2.6))
     panel = axes[0]
     panel.axhspan(-SMALL_EFFECT, SMALL_EFFECT, color=GREY, alpha=0.25, linewidth=0.0)
-    groups = list(table.groupby("robot", sort=False))
-    shifts = np.linspace(-_SPREAD, _SPREAD, len(groups)) if len(groups) > 1 else [0.0]
+    robots = table["robot"].unique()
+    shifts = np.linspace(-_SPREAD, _SPREAD, len(robots)) if len(robots) > 1 else [0.0]
 
-    for i, (name, rows) in enumerate(groups):
-        colour = ROBOTS[i % len(ROBOTS)]
-        marker = MARKERS[i % len(MARKERS)]
-        x = rows["mission"].to_numpy() + shifts[i]
-        y = rows["effect"].to_numpy()
-        odd = rows["stands_out"].to_numpy(dtype=bool)
-        panel.errorbar(x, y, 2.0 * rows["sd"].to_numpy(), color=colour, fmt="none", elinewidth=1.0)
-        panel.plot(x, y, marker, color=colour, markerfacecolor=background(), label=str(name))
-        panel.plot(x[odd], y[odd], marker, color=colour)
+    for shift, (name, colour, marker) in zip(shifts, robot_looks(robots), strict=True):
+        rows = table[table["robot"] == name]
+        odd = rows[rows["stands_out"].astype(bool)]
+        x = rows["mission"] + shift
+        y = rows["effect"]
+        panel.errorbar(x, y, 2.0 * rows["sd"], color=colour, fmt="none", elinewidth=1.0)
+        panel.plot(x, y, marker, color=colour, markerfacecolor=background(), label=name)
+        panel.plot(odd["mission"] + shift, odd["effect"], marker, color=colour)
 
     panel.set(xlabel="mission", ylabel="effect on contact\nat full sight")
     panel.xaxis.set_major_locator(MaxNLocator(integer=True))
-    add_legend(axes, panel.get_legend_handles_labels()[0])
+    add_legend(axes, handles_of(panel))
     return panel

@@ -7,30 +7,27 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from matplotlib import colormaps
-from matplotlib.colors import to_hex
 
 from trustbo.data import Cell, path_text
 from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
 from trustbo.plots.maps import (
-    BRIGHT_HIGH,
-    BRIGHT_LOW,
     cells_of,
-    contours,
     extent_of,
     is_good_high,
     is_trust,
+    limits_of,
     positions_of,
-    robust_limits,
-    trust_limits,
+    shown_values,
+    smooth_ground,
 )
-from trustbo.plots.style import ROBOTS
+from trustbo.plots.style import robot_looks
 from trustbo.workspace.grid import Grid
 
 _PLANNED_ON = "trust map used to plan the mission"
-_MARKERS = ("circle", "square", "diamond", "triangle", "inverted_triangle", "plus")
+_BOKEH_MARKERS = {"o": "circle", "s": "square", "D": "diamond", "^": "triangle",
+                  "v": "inverted_triangle"}  # fmt: skip
 _HEIGHT = 800
 """Height of the page in a notebook, pixels."""
 _WIDTH = 600
@@ -42,11 +39,10 @@ _BELOW = 200
 _UPDATE = """
 const n = mission.value
 const column = layer.value == planned_on ? `mission ${n}` : layer.value
+const look = looks[layer.value]
 cells.data = {...cells.data, value: cells.data[column]}
-colours.palette = palettes[layer.value]
-colours.low = limits[column][0]
-colours.high = limits[column][1]
-bar.title = titles[layer.value]
+colours.setv(look.colours)
+bar.title = look.title
 planned.data = paths[n - 1]
 text.text = texts[n - 1]
 """
@@ -112,90 +108,50 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
 
     grid = plan.workspace.grid
     layers = _layers(plan, maps, history)
-    names = [name for name in layers if not name.startswith("mission ")]
-    trusts = [name for name in layers if name == "trust mean" or name not in names]
-    limits = {name: robust_limits(values) for name, values in layers.items()}
-    limits |= dict.fromkeys(trusts, trust_limits(np.stack([layers[name] for name in trusts])))
-
-    x, y = np.meshgrid(grid.x - grid.corner[0], grid.y - grid.corner[1])
-    row, col = np.indices(grid.shape)
-    columns = {name: values.ravel() for name, values in layers.items()}
-    position = {"x": x.ravel(), "y": y.ravel(), "cell_row": row.ravel(), "cell_col": col.ravel()}
-    cells = models.ColumnDataSource({**position, **columns, "value": columns[names[0]]})
-
-    titles = {name: _title(name, maps, limits[name]) for name in names}
-    titles[_PLANNED_ON] = _title(_PLANNED_ON, maps, limits[names[0]])
-    palettes = {name: _palette(name) for name in titles}
-
-    low, high = limits[names[0]]
-    colours = models.LinearColorMapper(
-        palette=palettes[names[0]], low=low, high=high, nan_color="#9a9a9a"
-    )
-    bar = models.ColorBar(color_mapper=colours, height=12, title=titles[names[0]])
-    plot = _plot_cells(plan, names, cells, colours)
-    plot.add_layout(bar, "below")
-
+    looks = _looks(layers, maps)
     paths = [_places(cells_of(steps), grid) for steps in history["path"].values]
     texts = [_text(history.isel(iteration=i), plan.objective) for i in range(len(paths))]
-    n_missions = len(paths)
-    planned = models.ColumnDataSource(paths[-1])
-    plot.line(
-        "x",
-        "y",
-        source=planned,
-        color=ROBOTS[1],
-        line_width=4,
-        line_dash="dashed",
-        legend_label="plan of the mission",
-    )
 
+    plot, of_plot = _plot_cells(plan, layers, looks)
+    planned = models.ColumnDataSource(paths[-1])
+    dashed = {"color": "#d55e00", "line_width": 4, "line_dash": "dashed"}
+    plot.line("x", "y", source=planned, legend_label="plan of the mission", **dashed)
     _draw_plan(plot, plan)
+
     plot.legend.click_policy = "hide"
     plot.legend.update(orientation="horizontal", ncols=2, location="left", spacing=8, margin=0)
     plot.add_layout(plot.legend[0], "below")
 
-    layer = models.Select(title="Layer", value=names[0], options=[*names, _PLANNED_ON])
+    last = len(paths)
+    wide: dict[str, Any] = {"sizing_mode": "stretch_width"}
+    layer = models.Select(title="Layer", value=next(iter(looks)), options=[*looks])
     mission = models.Slider(
-        title="Mission",
-        start=1,
-        end=max(n_missions, 2),
-        value=n_missions,
-        step=1,
-        visible=n_missions > 1,
-        sizing_mode="stretch_width",
+        title="Mission", start=1, end=max(last, 2), value=last, step=1, visible=last > 1, **wide
     )
-    text = models.Div(text=texts[-1], sizing_mode="stretch_width")
-    shared = {
-        "cells": cells,
-        "colours": colours,
-        "planned": planned,
-        "layer": layer,
-        "mission": mission,
-        "text": text,
-        "bar": bar,
-        "limits": limits,
-        "palettes": palettes,
-        "titles": titles,
-        "paths": paths,
-        "texts": texts,
-        "planned_on": _PLANNED_ON,
-    }
+    text = models.Div(text=texts[-1], **wide)
+
+    shared = {"layer": layer, "mission": mission, "text": text, "planned": planned, "paths": paths}
+    shared |= {"texts": texts, "looks": looks, "planned_on": _PLANNED_ON, **of_plot}
     update = models.CustomJS(args=shared, code=_UPDATE)
     layer.js_on_change("value", update)
     mission.js_on_change("value", update)
 
     styles = {"max-width": "900px", "margin": "0 auto", "padding": "0 8px"}
-    return column(layer, mission, text, plot, sizing_mode="stretch_width", styles=styles)
+    return column(layer, mission, text, plot, styles=styles, **wide)
 
 
-def _plot_cells(plan: Plan, names: Sequence[str], cells: Any, colours: Any) -> Any:
-    """Plot the selected layer, with the values of all layers in `names` at the pointer.
+def _plot_cells(
+    plan: Plan, layers: dict[str, np.ndarray], looks: dict[str, Any]
+) -> tuple[Any, dict[str, Any]]:
+    """Plot the first layer, with the values of all layers at the pointer.
 
     Args:
         plan: Plan, whose workspace has the contour lines.
-        names: Names of the layers.
-        cells: Bokeh data source of the cells, whose column `value` is shown.
-        colours: Colour mapper.
+        layers: Maps (row, col), keyed by name.
+        looks: Colours and title of each layer that can be selected; see `_looks`.
+
+    Returns:
+        The plot, and its parts that change with the layer, keyed by their names in `_UPDATE`.
     """
     from bokeh import models
     from bokeh.plotting import figure
@@ -214,88 +170,101 @@ def _plot_cells(plan: Plan, names: Sequence[str], cells: Any, colours: Any) -> A
         y_axis_label="north (m)",
     )
     plot.grid.visible = False
-    size: dict[str, Any] = {"width": grid.cell_width, "height": grid.cell_height}
+
+    row, col = np.indices(grid.shape).reshape(2, -1)
+    names = [name for name in looks if name in layers]
+    columns: dict[str, Any] = {name: values.ravel() for name, values in layers.items()}
+    columns |= {"cell_row": row, "cell_col": col, "value": columns[names[0]]}
+    columns |= _places(np.column_stack([row, col]), grid)
+    cells = models.ColumnDataSource(columns)
+
+    look = looks[names[0]]
+    colours = models.LinearColorMapper(**look["colours"], nan_color="#9a9a9a")
     fill: Any = {"field": "value", "transform": colours}
+    size: dict[str, Any] = {"width": grid.cell_width, "height": grid.cell_height}
     drawn = plot.rect("x", "y", source=cells, fill_color=fill, line_color=None, **size)
 
     tips = [("cell", "@cell_row,@cell_col"), ("selected layer", "@value{0.000}")]
-    tips += ((n, f"@{{{n}}}{{0.000}}") for n in names)
+    tips += ((name, f"@{{{name}}}{{0.000}}") for name in names)
     plot.add_tools(models.HoverTool(renderers=[drawn], tooltips=tips))
 
-    lines = contours(plan.workspace)
-    if lines:
-        xs: Any = [line[:, 0] for line in lines]
-        ys: Any = [line[:, 1] for line in lines]
-        plot.multi_line(xs, ys, color="black", alpha=0.25, line_width=0.7)
-    return plot
+    ground = smooth_ground(plan.workspace)
+    if ground is not None:
+        plot.contour(*ground, line_color="black", line_alpha=0.25, line_width=0.7)
+
+    bar = models.ColorBar(color_mapper=colours, height=12, title=look["title"])
+    plot.add_layout(bar, "below")
+    return plot, {"cells": cells, "colours": colours, "bar": bar}
 
 
 def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.ndarray]:
     """Return maps (row, col), keyed by name; "mission 1" is the trust map of the first mission."""
-    free = plan.workspace.passable.values
-    grid = plan.workspace.grid
+    workspace = plan.workspace
     layers = {
-        str(name).replace("_", " "): grid.over_cells(str(name), values).values
+        str(name).replace("_", " "): shown_values(values, workspace)
         for name, values in maps.data_vars.items()
         if values.ndim == 2
     }
+    for i, trust in history["trust_map"].groupby("iteration"):
+        values = shown_values(trust.squeeze("iteration"), workspace)
+        values[plan.path[0]] = np.nan  # assumed
+        layers[f"mission {i}"] = values
+    return layers
 
-    trust = history["trust_map"].transpose("iteration", "row", "col").values
-    layers |= {f"mission {i + 1}": values for i, values in enumerate(trust)}
 
-    learned = free.copy()
-    learned[plan.path[0]] = False  # the trust at the start is assumed
-    about_trust = "trust", "cost", "mission"
-    return {
-        name: np.where(learned if name.startswith(about_trust) else free, values, np.nan)
-        for name, values in layers.items()
-    }
+def _looks(layers: dict[str, np.ndarray], maps: xr.Dataset) -> dict[str, Any]:
+    """Return the colours and the title of the colour bar of each layer that can be selected.
+
+    The trust after the last mission and the maps used for planning share one scale.
+    """
+    from bokeh.palettes import Viridis256
+
+    shared = [name for name in layers if name.startswith(("trust mean", "mission "))]
+    of_trust = limits_of(np.stack([layers[name] for name in shared]), is_trust=True)
+
+    looks = {}
+    for name in (*(name for name in layers if not name.startswith("mission ")), _PLANNED_ON):
+        trusted = name in shared or name == _PLANNED_ON
+        low, high = of_trust if trusted else limits_of(layers[name], is_trust=False)
+        title = name
+        if name in layers:
+            title = str(maps[name.replace(" ", "_")].attrs.get("long_name", name))
+        if is_trust(name) and high == 1.0:
+            title += " (1 or more: unbroken contact)"
+
+        palette = Viridis256 if is_good_high(name) else Viridis256[::-1]
+        looks[name] = {"colours": {"palette": palette, "low": low, "high": high}, "title": title}
+    return looks
 
 
 def _draw_plan(plot: Any, plan: Plan) -> None:
     """Plot the recommended path and, with a terrain, the posts and routes of the robots."""
     grid = plan.workspace.grid
-    corner = np.array(grid.corner)
     path = _places(plan.path, grid)
-    plot.line(path["x"], path["y"], color="black", line_width=5, legend_label="recommended")
-    plot.line(path["x"], path["y"], color="white", line_width=3, legend_label="recommended")
-
+    for colour, width in (("black", 5), ("white", 3)):
+        plot.line(**path, color=colour, line_width=width, legend_label="recommended")
     for k, marker in ((0, "circle"), (-1, "star")):
-        x = path["x"][k]
-        y = path["y"][k]
-        plot.scatter([x], [y], marker=marker, size=14, color="white", line_color="black")
+        look = {"marker": marker, "size": 14, "color": "white", "line_color": "black"}
+        plot.scatter(path["x"][k], path["y"][k], **look)
 
     if plan.posts is None or plan.routes is None:
         return
 
-    for i, name in enumerate(plan.workspace.team.names):
-        x, y = (plan.posts[:, i] - corner).T
-        look = {"color": ROBOTS[i % len(ROBOTS)], "legend_label": f"posts of {name}"}
-        marker = _MARKERS[i % len(_MARKERS)]
-        plot.scatter(x, y, marker=marker, size=8, line_color="white", **look)
-        routes = [bound[i + 1] - corner for bound in plan.routes if bound[i + 1] is not None]
+    for i, (name, colour, marker) in enumerate(robot_looks(plan.workspace.team.names)):
+        x, y = (plan.posts[:, i] - grid.corner).T
+        routes = [
+            route - grid.corner for _, *others in plan.routes if (route := others[i]) is not None
+        ]
+        look = {"color": colour, "legend_label": f"posts of {name}"}
+        shape = _BOKEH_MARKERS.get(marker, "plus")
+        plot.scatter(x, y, marker=shape, size=8, line_color="white", **look)
         plot.multi_line([r[:, 0] for r in routes], [r[:, 1] for r in routes], **look)
 
 
-def _places(path: Sequence[Cell], grid: Grid) -> dict[str, Any]:
-    """Return the data source of a line along a path; see `positions_of`."""
-    x, y = positions_of(path, grid)
-    return {"x": x.tolist(), "y": y.tolist()}
-
-
-def _palette(name: str) -> list[str]:
-    """Return 256 colours for a layer, from low to high values; good values are bright."""
-    colours = colormaps[BRIGHT_HIGH if is_good_high(name) else BRIGHT_LOW]
-    return [to_hex(colour) for colour in colours(np.linspace(0.0, 1.0, 256))]
-
-
-def _title(name: str, maps: xr.Dataset, limits: tuple[float, float]) -> str:
-    """Return the label of the colour bar for a layer."""
-    variable = maps.get(name.replace(" ", "_"))
-    text = name if variable is None else variable.attrs.get("long_name", name)
-    if is_trust(name) and limits[1] == 1.0:
-        return f"{text} (1 or more: unbroken contact)"
-    return str(text)
+def _places(path: Sequence[Cell] | np.ndarray, grid: Grid) -> dict[str, Any]:
+    """Return the data source of cells or of a line along a path; see `positions_of`."""
+    x, y = positions_of(path, grid).T.tolist()
+    return {"x": x, "y": y}
 
 
 def _text(mission: xr.Dataset, objective: str) -> str:

@@ -6,43 +6,37 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from contourpy import contour_generator
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, ListedColormap, Normalize
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 from scipy.ndimage import gaussian_filter
 
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_list, require_tuple, require_whole
 from trustbo.plots.style import (
     GREY,
+    N_INTERVALS,
     add_legend,
     as_text,
     background,
     figure_of,
+    handles_of,
     in_lines,
     ink,
     is_broad,
     outlined,
     panels,
-    round_ticks,
     styled,
 )
-from trustbo.terrain import pixel_size
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid
 from trustbo.workspace.moves import require_on_grid
 
 MOMENTS = (1, 2, 4)
 """Missions for which `trust_maps` plots the map used for planning, by default."""
-VEGETATION = (0.44, 0.56, 0.39, 0.4)
-"""Colour of vegetation: a semi-transparent green for light and dark backgrounds."""
-_GROWN = 0.5
-"""Minimum height of vegetation above the ground, m."""
 _CONTOURS = 12
 """Maximum number of contour levels."""
 _LEVEL = 0.05
@@ -71,6 +65,20 @@ _LONGEST_BAR = 0.4
 """Longest scale bar, as a fraction of the width of a map."""
 _BAR_END = 0.96
 """Right end of the scale bar, as a fraction of the width of a map."""
+_BAR_LOW = 0.045
+"""Height of the scale bar above the edge of a map, as a fraction of the height of the map."""
+_EXTENDED = {(False, False): "neither", (True, False): "min", (False, True): "max"}
+"""Pointed ends of a colour bar, keyed by whether values are below and above its limits."""
+_WIDTH = 7.0
+"""Width of a new figure of the grid, in inches."""
+_HEIGHTS = (2.0, 11.0)
+"""Least and largest height of a new figure of the grid, in inches."""
+_LARGEST_LABEL = 8.0
+"""Size of the labels of cells, points, if cells are wide enough."""
+_LABEL_WIDTH = 3.2
+"""Width of a label, such as "10,12", per size."""
+_MAX_LABELLED = 24
+"""Number of rows or columns up to which every cell is labelled."""
 
 
 @styled
@@ -127,50 +135,35 @@ def trust_maps(
             f"missions has {max(chosen)}, but the last mission is {n_missions}; leave it out."
         )
 
-    maps = [history["trust_map"].sel(iteration=i) for i in chosen] + [trust_map]
-    maps = [workspace.grid.over_cells("trust_map", trust) for trust in maps]
-    steps = [history["path"].sel(iteration=i).values for i in chosen] + [np.array(path)]
-    paths = [cells_of(cells) for cells in steps]
-    learned = [i - 1 for i in chosen] + [n_missions]
+    planned = history.transpose("iteration", ...).sel(iteration=chosen)
+    maps = np.stack(
+        [shown_values(values, workspace) for values in [*planned["trust_map"], trust_map]]
+    )
+    paths = [*map(cells_of, planned["path"].values), np.array(path)]
+    learned = [*(i - 1 for i in chosen), n_missions]
 
-    values = np.stack([trust.values for trust in maps])
-    values[:, *path[0]] = np.nan
-    low, high = trust_limits(values[[n > 0 for n in learned]])
-    norm = Normalize(low, high)
+    maps[:, *path[0]] = np.nan
+    norm = Normalize(*limits_of(maps[np.array(learned) > 0], is_trust=True))
 
     axes = map_panels(workspace.grid, len(maps), ax)
-    for panel, trust, cells, n in zip(axes, values, paths, learned, strict=True):
-        draw_cells(panel, maps[0].copy(data=trust), workspace, norm)
+    for panel, values, cells, n in zip(axes, maps, paths, learned, strict=True):
+        draw_cells(panel, values, workspace, norm, BRIGHT_HIGH)
         if driven is not None:
-            hatch_undriven(panel, np.asarray(driven)[n], workspace)
+            new = workspace.passable.values & ~np.asarray(driven)[n]
+            _hatch(panel, *edges_of(workspace.grid), new, "none", **_HATCH)
         draw_path(panel, cells, workspace.grid)
-        panel.set_title(_moment(n, panel))
 
-    draw_scale(axes[0], workspace.grid)
-    shown = np.where(workspace.passable.values, values, np.nan)
-    trust_bar(axes, ScalarMappable(norm), shown, "expected trust")
+        # In two lines if the panel is narrow.
+        words = ("before", "mission 1") if n == 0 else ("after", f"mission {n}")
+        panel.set_title((" " if is_broad(panel) else "\n").join(words))
+
+    _trust_bar(axes, ScalarMappable(norm), maps, "expected trust", explain=True)
     if ax is None:
-        add_legend(axes, _legend(driven is not None))
+        handles = [*handles_of(axes[0]), Patch(facecolor=GREY, label="impassable or start")]
+        if driven is not None:
+            handles.append(Patch(facecolor="0.9", label="never entered", **_HATCH))
+        add_legend(axes, handles)
     return axes
-
-
-def _moment(n: int, panel: Axes) -> str:
-    """Describe the moment after n missions, in two lines if the panel is narrow."""
-    words = ("before", "mission 1") if n == 0 else ("after", f"mission {n}")
-    return (" " if is_broad(panel) else "\n").join(words)
-
-
-def _legend(hatched: bool) -> list[Line2D | Patch]:
-    """Return the legend of maps with a path."""
-    white: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": "none"}
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], marker="o", markersize=6, label="start", **white),
-        Line2D([], [], marker="*", markersize=11, label="goal", **white),
-        Patch(facecolor=GREY, label="impassable or start"),
-    ]
-    if hatched:
-        handles.append(Patch(facecolor="0.9", label="never entered", **_HATCH))
-    return handles
 
 
 @styled
@@ -216,9 +209,8 @@ def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
 
     for panel in axes:
         draw_contours(panel, workspace, "black", 0.25)
-        draw_cell_edges(panel, grid)
+        _draw_edges(panel, *edges_of(grid), color="white", linewidth=0.3)
 
-    draw_scale(surface, grid)
     colour_bar(axes, heights, "height (m)", location="bottom", aspect=40)
     colour_bar(axes, ScalarMappable(Normalize(0.0, 1.0)), "index\n(0 worst, 1 best)")
     return axes
@@ -266,30 +258,79 @@ def cell_map(
     require_kind("values", values, xr.DataArray, "give a map of the cells")
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
     shown = shown_values(values, workspace)
+    name = str(values.name)
     norm = Normalize()
     if limits is not None:
-        low, high = require_tuple("limits", limits, 2)
-        norm = Normalize(low, high)
-    elif is_trust(str(values.name)) and np.isfinite(shown).any():
-        norm = Normalize(*up_to_contact(float(np.nanmin(shown)), float(np.nanmax(shown))))
+        norm.vmin, norm.vmax = require_tuple("limits", limits, 2)
+    elif np.isfinite(shown).any():
+        norm.vmin, norm.vmax = limits_of(shown, (0.0, 1.0), is_trust=is_trust(name))
     if label is not None:
         require_kind("label", label, str, "give a text; '' for no colour bar")
-    cells = None if path is None else require_path_of_cells(path, workspace)
+    if path is not None:
+        path = require_path_of_cells(path, workspace)
 
     axes = map_panels(workspace.grid, 1, ax)
-    image = draw_cells(axes[0], values, workspace, norm, cmap)
+    good = BRIGHT_HIGH if is_good_high(name) else BRIGHT_LOW
+    image = draw_cells(axes[0], shown, workspace, norm, cmap or good)
 
-    if cells is not None:
-        draw_path(axes[0], cells, workspace.grid)
-    draw_scale(axes[0], workspace.grid)
-    if label != "":
-        name = values.attrs.get("long_name", values.name)
-        text = label or as_text(name or "")
-        if is_trust(str(values.name)):
-            trust_bar(axes, image, shown, text, explain=label is None)
-        else:
-            colour_bar(axes, image, text, extend=_extend(shown, norm))
+    if path is not None:
+        draw_path(axes[0], path, workspace.grid)
+    if label == "":
+        return axes[0]
+
+    text = label or as_text(values.attrs.get("long_name", values.name or ""))
+    if is_trust(name):
+        _trust_bar(axes, image, shown, text, explain=label is None)
+    else:
+        colour_bar(axes, image, text, shown)
     return axes[0]
+
+
+@styled
+def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
+    """Plot the mean height of each cell, labelled with its row and column.
+
+    Impassable cells are hatched. Without a terrain, passable cells are blank.
+
+    Args:
+        workspace: Workspace of the cells.
+        ax: Axes to draw on; by default a new figure.
+
+    Returns:
+        Axes of the figure.
+
+    Example:
+        >>> tb.plots.grid_map(workspace).figure.savefig("grid.png")
+    """
+    require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
+    grid = workspace.grid
+    rows, cols = grid.shape
+
+    tall = grid.cell_height / grid.cell_width
+    height = float(np.clip(_WIDTH * rows * tall / cols, *_HEIGHTS))
+    axes = panels(1, ax, (_WIDTH, height))
+    panel = axes[0]
+
+    x = np.arange(cols + 1) - 0.5
+    y = np.arange(rows + 1) - 0.5
+
+    if workspace.terrain is not None:
+        light = ListedColormap(colormaps["YlOrBr"](np.linspace(0.0, 0.55, 256)))
+        image = panel.pcolormesh(x, y, grid.cell_means(workspace.terrain["dem"]), cmap=light)
+        colour_bar(axes, image, "mean height (m)", pad=0.05)
+
+    _hatch(panel, x, y, ~workspace.passable.values, "0.8", hatch="///", edgecolor="0.6", lw=0.0)
+    _draw_edges(panel, x, y, color="black", linewidth=0.4)
+
+    if max(rows, cols) <= _MAX_LABELLED:
+        room = figure_of(axes).get_figwidth() * panel.get_position().width / cols  # inches
+        size = min(_LARGEST_LABEL, 72.0 * room / _LABEL_WIDTH)  # 72 points per inch
+        for row, col in np.ndindex(*grid.shape):
+            panel.text(col, row, f"{row},{col}", ha="center", va="center", size=size, color="black")
+
+    panel.set(xlabel="column", ylabel="row", xlim=x[[0, -1]], ylim=y[[-1, 0]], aspect=tall)
+    panel.set_title(f"{grid.crs_name}\nhatched: without data or too steep")
+    return panel
 
 
 def is_trust(name: str) -> bool:
@@ -310,28 +351,28 @@ def require_path_of_cells(path: Sequence[Cell], workspace: Workspace) -> list[Ce
     return cells
 
 
-def cells_of(steps: np.ndarray) -> list[Cell]:
-    """Return the cells of a path in a history, (step, 2), without the padding of -1."""
-    return [(int(row), int(col)) for row, col in steps if row >= 0]
+def cells_of(steps: np.ndarray) -> np.ndarray:
+    """Return the cells of a path in a history, shape (step, 2), without the padding of -1."""
+    return steps[steps[:, 0] >= 0]
 
 
-def positions_of(path: Sequence[Cell], grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y of a path's cells, each (cell,), m from the lower left corner of the grid."""
-    x, y = (np.array([grid.center(cell) for cell in path]) - grid.corner).T
-    return x, y
+def positions_of(path: Sequence[Cell] | np.ndarray, grid: Grid) -> np.ndarray:
+    """Return positions of a path's cells, (cell, 2), in metres from the lower left corner."""
+    row, col = np.transpose(path)
+    return np.column_stack([grid.x[col], grid.y[row]]) - grid.corner
 
 
-def draw_path(ax: Axes, path: Sequence[Cell], grid: Grid) -> None:
+def draw_path(ax: Axes, path: Sequence[Cell] | np.ndarray, grid: Grid) -> None:
     """Plot a path over a map, from its start (circle) to its goal (star)."""
-    x, y = positions_of(path, grid)
-    (line,) = ax.plot(x, y, color="white", linewidth=1.6, solid_joinstyle="round")
-    line.set_path_effects(outlined(3.2, "black"))
-    ax.plot(x[0], y[0], "wo", markeredgecolor="black", markersize=6)
-    ax.plot(x[-1], y[-1], "w*", markeredgecolor="black", markersize=11)
+    places = positions_of(path, grid)
+    outline = outlined(3.2, "black")
+    ax.plot(*places.T, "w", linewidth=1.6, solid_joinstyle="round", path_effects=outline)
+    ax.plot(*places[0], "wo", markeredgecolor="black", markersize=6, label="start")
+    ax.plot(*places[-1], "w*", markeredgecolor="black", markersize=11, label="goal")
 
 
 def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
-    """Return axes for n maps; positions are in metres from the lower left corner of the grid."""
+    """Return axes for n maps, in metres from the lower left corner; the first has a scale bar."""
     left, right, bottom, top = extent_of(grid)
     tall = float(np.clip((top - bottom) / (right - left), 0.3, 3.0))
     width = 3.0 if n > 1 else 4.0
@@ -348,34 +389,43 @@ def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
         panel.set(xlabel="east (m)", ylabel="north (m)")
         if panel.get_subplotspec() is not None:
             panel.label_outer()
+    draw_scale(axes[0])
     return axes
 
 
-def colour_bar(axes: Sequence[Axes] | np.ndarray, image: Any, label: str, **options: Any) -> Any:
-    """Draw a colour bar beside axes, and return it."""
-    bar = axes[0].figure.colorbar(image, ax=list(axes), pad=0.02, ticks=round_ticks(), **options)
+def colour_bar(
+    axes: Sequence[Axes] | np.ndarray,
+    image: Any,
+    label: str,
+    values: np.ndarray | None = None,
+    *,
+    pad: float = 0.02,
+    **options: Any,
+) -> Any:
+    """Draw a colour bar beside axes, and return it; its ends are pointed if `values` exceed it."""
+    if values is not None and image.norm.scaled():
+        found = values[np.isfinite(values)]
+        beyond = bool((found < image.norm.vmin).any()), bool((found > image.norm.vmax).any())
+        options["extend"] = _EXTENDED.get(beyond, "both")
+
+    ticks = MaxNLocator(N_INTERVALS, steps=[1.0, 2.0, 2.5, 5.0, 10.0])
+    bar = figure_of(axes).colorbar(image, ax=list(axes), pad=pad, ticks=ticks, **options)
     bar.set_label(in_lines(label, axes) if bar.orientation == "vertical" else label)
     return bar
 
 
-def trust_bar(
-    axes: Sequence[Axes] | np.ndarray,
-    image: Any,
-    values: np.ndarray,
-    label: str,
-    *,
-    explain: bool = True,
+def _trust_bar(
+    axes: np.ndarray, image: Any, values: np.ndarray, label: str, *, explain: bool
 ) -> None:
     """Draw a colour bar of trust; an upper end of 1 is labelled "≥ 1" if values exceed 1.
 
-    Unless `explain` is false, the label of the bar in a large figure explains that 1 is unbroken
-    contact.
+    With `explain`, the label of the bar in a large figure explains that 1 is unbroken contact.
     """
-    bar = colour_bar(axes, image, label, extend=_extend(values, image.norm))
+    bar = colour_bar(axes, image, label, values)
     if image.norm.vmax != 1.0:
         return
 
-    is_above = bool((values[np.isfinite(values)] > 1.0).any())
+    is_above = bar.extend in ("max", "both")
     if explain and (figure_of(axes).get_size_inches() >= _LEAST_SIZE).all():
         more = "; estimates\ncan be higher" if is_above else ""
         bar.set_label(f"{label}\n(1: unbroken\ncontact{more})")  # short lines, as bars are short
@@ -384,28 +434,12 @@ def trust_bar(
         bar.update_ticks()
 
 
-def _extend(values: np.ndarray, norm: Normalize) -> str:
-    """Return the ends of a colour scale beyond which there are values."""
-    found = values[np.isfinite(values)]
-    below = bool((found < norm.vmin).any()) if norm.vmin is not None else False
-    above = bool((found > norm.vmax).any()) if norm.vmax is not None else False
-    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[below, above]
-
-
 def draw_cells(
-    ax: Axes,
-    values: xr.DataArray,
-    workspace: Workspace,
-    norm: Normalize,
-    cmap: str | Colormap | None = None,
+    ax: Axes, shown: np.ndarray, workspace: Workspace, norm: Normalize, cmap: str | Colormap
 ) -> Any:
-    """Draw a map of the planning cells, and return the image; see `cell_map` for the colours."""
-    if cmap is None:
-        cmap = BRIGHT_HIGH if is_good_high(str(values.name)) else BRIGHT_LOW
-
+    """Draw values of the planning cells (row, col), and return the image; NaN is grey."""
     ax.set_facecolor(GREY)
-    data = shown_values(values, workspace)
-    image = ax.imshow(data, cmap=cmap, norm=norm, extent=extent_of(workspace.grid))
+    image = ax.imshow(shown, cmap=cmap, norm=norm, extent=extent_of(workspace.grid))
     draw_contours(ax, workspace, "black", 0.25)
     return image
 
@@ -420,135 +454,102 @@ def shown_values(values: xr.DataArray, workspace: Workspace) -> np.ndarray:
     return shown
 
 
-def hatch_undriven(ax: Axes, driven: np.ndarray, workspace: Workspace) -> None:
-    """Hatch the passable cells that were not `driven`, shape (row, col)."""
-    left, right, bottom, top = extent_of(workspace.grid)
-    rows, cols = workspace.grid.shape
-    x = np.linspace(left, right, cols + 1)
-    y = np.linspace(top, bottom, rows + 1)
-    new = np.ma.masked_array(np.ones((rows, cols)), driven | ~workspace.passable.values)
-    ax.pcolor(x, y, new, cmap=ListedColormap(["none"]), **_HATCH)
+def _hatch(
+    ax: Axes, x: np.ndarray, y: np.ndarray, cells: np.ndarray, colour: str, **style: Any
+) -> None:
+    """Hatch the given `cells`, a mask (row, col), between the edges x (col + 1,), y (row + 1,)."""
+    shown = np.ma.masked_array(np.ones(cells.shape), ~cells)
+    ax.pcolor(x, y, shown, cmap=ListedColormap([colour]), **style)
 
 
-def draw_ground(ax: Axes, workspace: Workspace) -> None:
-    """Draw vegetation and contour lines or, without a terrain, the cell edges."""
-    terrain = workspace.terrain
-    extent = extent_of(workspace.grid)
-    ax.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", xticks=[], yticks=[])
-    ax.spines[:].set_visible(True)
-    ax.grid(visible=False)  # its lines would look like edges of cells
-    if terrain is None:
-        draw_cell_edges(ax, workspace.grid)
-        return
-
-    grown = np.where((terrain["dsm"] - terrain["dem"]).values > _GROWN, 1.0, np.nan)
-    ax.imshow(grown, cmap=ListedColormap([VEGETATION]), extent=extent)
-    draw_contours(ax, workspace, GREY, 0.8)
-
-
-def draw_cell_edges(ax: Axes, grid: Grid) -> None:
-    """Draw the edges of all cells."""
-    _, right, _, top = extent_of(grid)
-    style: dict[str, Any] = {"color": "white", "linewidth": 0.3, "alpha": 0.5}
-    ax.vlines(np.arange(1, grid.shape[1]) * grid.cell_width, 0.0, top, **style)
-    ax.hlines(np.arange(1, grid.shape[0]) * grid.cell_height, 0.0, right, **style)
+def _draw_edges(ax: Axes, x: np.ndarray, y: np.ndarray, **style: Any) -> None:
+    """Draw all edges of cells, at x and y."""
+    ax.vlines(x, y[0], y[-1], alpha=0.5, **style)
+    ax.hlines(y, x[0], x[-1], alpha=0.5, **style)
 
 
 def draw_contours(ax: Axes, workspace: Workspace, colour: str, opacity: float) -> None:
-    """Draw contour lines of the ground, if there is a terrain."""
-    lines = LineCollection(contours(workspace), colors=colour, alpha=opacity, linewidths=0.5)
-    ax.add_collection(lines, autolim=False)
+    """Draw contour lines of the ground, if there is a terrain that is not level."""
+    ground = smooth_ground(workspace)
+    if ground is not None:
+        style: dict[str, Any] = {"linestyles": "solid", "linewidths": 0.5}
+        ax.contour(*ground, colors=colour, alpha=opacity, **style)
 
 
-def contours(workspace: Workspace) -> list[np.ndarray]:
-    """Compute contour lines of the ground at up to 12 round heights.
+def smooth_ground(
+    workspace: Workspace,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Sequence[float]] | None:
+    """Smooth the ground for contour lines at up to 12 round heights.
 
     Returns:
-        Lines, each (point, 2): x and y in metres from the lower left corner of the grid.
+        x (col,) and y (row,) of pixels, in metres from the lower left corner of the grid; smooth
+        heights (row, col), masked where unknown; and the heights of contour lines. None if the
+        ground is level or there is no terrain.
     """
-    if workspace.terrain is None:
-        return []
-
     terrain = workspace.terrain
+    if terrain is None:
+        return None
+
     step = math.ceil(max(terrain["dem"].shape) / _MAX_PIXELS)
-    height = terrain["dem"].values[::step, ::step]
+    ground = terrain["dem"][::step, ::step]
+    height = ground.values
     valid = np.isfinite(height)
     if min(height.shape) < 3 or not valid.any():
-        return []
+        return None
 
     # Smooth the known heights only (normalised convolution).
     width = max(1.0, _SMOOTH * max(height.shape))
     weight = gaussian_filter(valid.astype(float), width)
     smooth = gaussian_filter(np.where(valid, height, 0.0), width) / np.maximum(weight, 1e-9)
 
-    low = float(smooth[valid].min())
-    high = float(smooth[valid].max())
-    interval = contour_interval(high - low)
-    if interval is None:
-        return []
-
-    dy, dx = (float(size) for size in pixel_size(terrain))  # m
-    x = (np.arange(height.shape[1]) * step + 0.5) * dx
-    y = extent_of(workspace.grid)[3] - (np.arange(height.shape[0]) * step + 0.5) * dy
-    traced = contour_generator(x, y, np.ma.masked_where(~valid, smooth), line_type="Separate")
-    levels = np.arange(np.ceil(low / interval), np.floor(high / interval) + 1) * interval
-    return [np.asarray(line) for level in levels for line in traced.lines(level)]
-
-
-def contour_interval(relief: float) -> float | None:
-    """Choose a round contour interval, m, for this height range, m; None on level ground."""
-    if not relief > _LEVEL:
+    smooth = np.ma.masked_where(~valid, smooth)
+    low = float(smooth.min())
+    high = float(smooth.max())
+    if high - low <= _LEVEL:
         return None
-    magnitude = 10.0 ** np.floor(np.log10(relief / _CONTOURS))
-    steps = (factor * magnitude for factor in (1, 2, 5, 10))
-    return float(next(step for step in steps if relief / step <= _CONTOURS))
+
+    left, bottom = workspace.grid.corner
+    levels = MaxNLocator(_CONTOURS, steps=[1.0, 2.0, 5.0, 10.0]).tick_values(low, high)
+    return ground["x"].values - left, ground["y"].values - bottom, smooth, levels
 
 
-def robust_limits(values: np.ndarray) -> tuple[float, float]:
-    """Return limits of a colour scale: the 2 % and 98 % quantiles, to be robust to outliers."""
-    low, high = np.nanquantile(values, _ROBUST).tolist()
-    if low < high:
-        return low, high
-    return low - 0.5e-3, high + 0.5e-3  # a scale of one value has no colours
+def limits_of(
+    values: np.ndarray, ends: tuple[float, float] = _ROBUST, *, is_trust: bool
+) -> tuple[float, float]:
+    """Return limits of a colour scale: two quantiles, by default ones robust to outliers.
 
-
-def trust_limits(values: np.ndarray) -> tuple[float, float]:
-    """Return `robust_limits`, where an upper limit just above 1 (unbroken contact) becomes 1."""
-    return up_to_contact(*robust_limits(values))
-
-
-def up_to_contact(low: float, high: float) -> tuple[float, float]:
-    """Lower the upper end of a scale of trust to 1 if it is just above 1; see `trust_limits`."""
-    if low < 1.0 < high < _LOGIT:
+    An upper limit of trust just above 1 (unbroken contact) becomes 1.
+    """
+    low, high = np.nanquantile(values, ends).tolist()
+    if is_trust and low < 1.0 < high < _LOGIT:
         high = 1.0
-    return low, high
+    room = 0.05 if low == high else 0.0  # a scale of one value has no colours
+    return low - room, high + room
 
 
-def draw_scale(ax: Axes, grid: Grid) -> None:
+def draw_scale(ax: Axes) -> None:
     """Draw a scale bar, whose length is a round number, in the lower right corner of a map."""
     left, right = ax.get_xlim()
-    width = right - left
-    longest = _LONGEST_BAR * width
-    magnitude = 10.0 ** np.floor(np.log10(longest))
-    lengths = (factor * magnitude for factor in (1, 2, 5))
-    length = max(length for length in lengths if length <= longest * (1 + 1e-9))  # up to rounding
-    ends = [_BAR_END - length / width, _BAR_END]
+    longest = _LONGEST_BAR * (right - left)
+    lengths = np.array([1.0, 2.0, 5.0]) * 10.0 ** np.floor(np.log10(longest))
+    length = lengths[lengths <= longest * (1.0 + 1e-9)].max()  # up to rounding
 
-    (bar,) = ax.plot(ends, [0.045, 0.045], color=ink(), linewidth=2.0, transform=ax.transAxes)
-    bar.set(solid_capstyle="butt", path_effects=outlined(4.0, background()))
+    ends = (_BAR_END - length / (right - left), _BAR_END)
+    outline = outlined(4.0, background())
+    style: dict[str, Any] = {"linewidth": 2.0, "solid_capstyle": "butt", "transform": ax.transAxes}
+    ax.plot(ends, (_BAR_LOW, _BAR_LOW), color=ink(), path_effects=outline, **style)
 
     label = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m"
-    text = ax.annotate(
-        label,
-        (_BAR_END, 0.045),
-        (0.0, 2.5),  # points above the bar
-        xycoords="axes fraction",
-        textcoords="offset points",
-        ha="right",
-        va="bottom",
-        color=ink(),
-    )
+    place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
+    place |= {"ha": "right", "va": "bottom"}
+    text = ax.annotate(label, (_BAR_END, _BAR_LOW), (0.0, 2.5), color=ink(), **place)
     text.set_path_effects(outlined(2.5, background()))
+
+
+def edges_of(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Return x of the edges of columns, and y of rows from north, m from the lower left corner."""
+    rows, cols = grid.shape
+    return np.arange(cols + 1) * grid.cell_width, np.arange(rows, -1, -1) * grid.cell_height
 
 
 def extent_of(grid: Grid) -> tuple[float, float, float, float]:

@@ -1,18 +1,33 @@
 """Maps of each bound of a plan: stops of the lead, posts, sight lines and routes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from trustbo.errors import TrustboError, require_kind, require_list, require_whole
 from trustbo.planning import Plan
-from trustbo.plots.maps import VEGETATION, draw_ground, draw_path, draw_scale, extent_of
-from trustbo.plots.style import GREY, MARKERS, ROBOTS, add_legend, background, ink, panels, styled
+from trustbo.plots.maps import draw_contours, draw_path, draw_scale, extent_of
+from trustbo.plots.style import (
+    GREY,
+    add_legend,
+    background,
+    handles_of,
+    ink,
+    panels,
+    robot_looks,
+    styled,
+)
+from trustbo.workspace import Workspace
 
+_VEGETATION = (0.44, 0.56, 0.39, 0.4)
+"""Colour of vegetation: a semi-transparent green for light and dark backgrounds."""
+_GROWN = 0.5
+"""Minimum height of vegetation above the ground, m."""
 _DASHED = (0, (3, 1.5))
 """Line style of the routes between posts."""
 _HALF = 0.56
@@ -56,108 +71,102 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     size = (2.5, 2.6) if len(shown) else (5.0, 4.4)  # in inches
     axes = panels(1 + len(shown), ax, size)
     for panel in axes:
-        draw_ground(panel, plan.workspace)
+        _draw_ground(panel, plan.workspace)
     draw_path(axes[0], plan.path, plan.workspace.grid)
-    if not len(shown):
-        _draw_posts(axes[0], plan)
-    draw_scale(axes[0], plan.workspace.grid)
     axes[0].set_title(f"path of {n_bounds} bounds")
+    draw_scale(axes[0])
 
     for panel, k in zip(axes[1:], shown, strict=True):
-        _draw_bound(panel, plan, k - 1)
+        _draw_bound(panel, plan, k)
         (a, b), (c, d) = plan.path[k - 1 : k + 1]
         panel.set_title(f"bound {k}\n{a},{b} to {c},{d}")
 
     names = plan.workspace.team.names
-    add_legend(axes, _legend(names) if len(shown) else _legend_of_path(names))
+    if len(shown):
+        handles = _legend(names)
+    else:
+        _draw_posts(axes[0], plan)
+        handles = handles_of(axes[0])
+    add_legend(axes, [*handles, Patch(facecolor=_VEGETATION, label="vegetation")])
     return axes
+
+
+def _draw_ground(ax: Axes, workspace: Workspace) -> None:
+    """Draw vegetation and contour lines."""
+    terrain = workspace.terrain
+    assert terrain is not None  # noqa: S101
+    extent = extent_of(workspace.grid)
+    ax.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", xticks=[], yticks=[])
+    ax.spines[:].set_visible(True)
+    ax.grid(visible=False)  # its lines would look like edges of cells
+
+    grown = np.where((terrain["dsm"] - terrain["dem"]).values > _GROWN, 1.0, np.nan)
+    ax.imshow(grown, cmap=ListedColormap([_VEGETATION]), extent=extent)
+    draw_contours(ax, workspace, GREY, 0.8)
 
 
 def _draw_posts(ax: Axes, plan: Plan) -> None:
     """Plot the posts of all bounds as small markers."""
     posts = plan.posts
     assert posts is not None  # noqa: S101
-    for i, positions in enumerate(np.swapaxes(posts - np.array(plan.workspace.grid.corner), 0, 1)):
-        style = _filled(ROBOTS[i % len(ROBOTS)], _SMALL)
-        ax.plot(*positions.T, MARKERS[i % len(MARKERS)], **style, linestyle="none", zorder=7)
+    places = np.swapaxes(posts - plan.workspace.grid.corner, 0, 1)
+    looks = robot_looks(plan.workspace.team.names)
+    for of_robot, (name, colour, marker) in zip(places, looks, strict=True):
+        style = {**_filled(colour, _SMALL), "linestyle": "none", "label": f"posts: {name}"}
+        ax.plot(*of_robot.T, marker, **style, zorder=7)
 
 
 def _draw_bound(ax: Axes, plan: Plan, k: int) -> None:
-    """Plot bound k, counted from 0, and its surroundings."""
+    """Plot bound k, counted from 1, and its surroundings."""
     stops = plan.stops
     posts = plan.posts
     routes = plan.routes
     assert stops is not None and posts is not None and routes is not None  # noqa: S101, PT018
 
-    corner = np.array(plan.workspace.grid.corner)
-    lead, *others = [None if route is None else route - corner for route in routes[k]]
-    before, after = stops[k : k + 2] - corner
+    grid = plan.workspace.grid
+    ends = stops[k - 1 : k + 1] - grid.corner
+    places = posts[k - 1] - grid.corner
+    lead, *others = [None if route is None else route - grid.corner for route in routes[k - 1]]
 
     if lead is not None:
         ax.plot(*lead.T, color=ink(), linewidth=2.6, zorder=3)
+    ax.plot(*ends.T, "*", **_filled(ink(), 11.0), linestyle="none", zorder=6)
 
-    for i, (post, route) in enumerate(zip(posts[k] - corner, others, strict=True)):
-        colour = ROBOTS[i % len(ROBOTS)]
-        marker = MARKERS[i % len(MARKERS)]
-        ax.plot(*np.stack([post, after]).T, color=colour, linewidth=0.8, zorder=5)
+    looks = robot_looks(plan.workspace.team.names)
+    for post, route, (_, colour, marker) in zip(places, others, looks, strict=True):
+        ax.plot(*np.stack([post, ends[1]]).T, color=colour, linewidth=0.8, zorder=5)
         ax.plot(*post, marker, **_filled(colour), zorder=7)
         if route is not None:
             ax.plot(*route.T, color=colour, linewidth=1.4, linestyle=_DASHED, zorder=4)
             ax.plot(*route[-1], marker, **_open(colour), zorder=6)
 
-    ax.plot(*np.stack([before, after]).T, "*", **_filled(ink(), 11), linestyle="none", zorder=6)
-
     driven = [route for route in (lead, *others) if route is not None]
-    seen = np.concatenate([[before, after], posts[k] - corner, *driven])
-
-    middle = (seen.min(0) + seen.max(0)) / 2.0
-    half = _HALF * float(np.ptp(seen, axis=0).max()) + _LEAST_HALF
-
-    left, right, bottom, top = extent_of(plan.workspace.grid)
-    ax.set_xlim(*_window(middle[0], half, left, right))
-    ax.set_ylim(*_window(middle[1], half, bottom, top))
-    draw_scale(ax, plan.workspace.grid)
+    _zoom(ax, np.concatenate([ends, places, *driven]), np.array(extent_of(grid)[1::2]))
+    draw_scale(ax)
 
 
-def _window(middle: float, half: float, low: float, high: float) -> tuple[float, float]:
-    """Return the limits of a window around a point, shifted so that it is within the map."""
-    width = min(2.0 * half, high - low)
-    left = float(np.clip(middle - width / 2.0, low, high - width))
-    return left, left + width
+def _zoom(ax: Axes, places: np.ndarray, size: np.ndarray) -> None:
+    """Show the surroundings of places (point, 2), within a map of this width and height, m."""
+    low = places.min(0)
+    high = places.max(0)
+    half = _HALF * float((high - low).max()) + _LEAST_HALF
+
+    shown = np.minimum(2.0 * half, size)
+    left, bottom = np.clip((low + high - shown) / 2.0, 0.0, size - shown)
+    ax.set(xlim=(left, left + shown[0]), ylim=(bottom, bottom + shown[1]))
 
 
-def _legend_of_path(names: Sequence[str]) -> list[Line2D | Patch]:
-    """Return the legend of the map of the path."""
-    white: dict[str, Any] = {"color": "white", "markeredgecolor": "black", "linestyle": "none"}
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], marker="o", markersize=6, label="start", **white),
-        Line2D([], [], marker="*", markersize=11, label="goal", **white),
-    ]
-    for i, name in enumerate(names):
-        marker = MARKERS[i % len(MARKERS)]
-        style = _filled(ROBOTS[i % len(ROBOTS)], _SMALL)
-        handles.append(
-            Line2D([], [], marker=marker, linestyle="none", label=f"posts: {name}", **style)
-        )
-    return [*handles, Patch(facecolor=VEGETATION, label="vegetation")]
+def _legend(names: Iterable[str]) -> list[Line2D]:
+    """Return the legend of the maps of bounds."""
+    lead = {"marker": "*", "linewidth": 2.6, "label": "lead: stops, route"}
+    lines: list[dict[str, Any]] = [lead | _filled(ink(), 11.0)]
+    for name, colour, marker in robot_looks(names):
+        robot = {"marker": marker, "linestyle": _DASHED, "label": f"{name}: post, route"}
+        lines.append(robot | _filled(colour))
 
-
-def _legend(names: Sequence[str]) -> list[Line2D | Patch]:
-    star = _filled(ink(), 11)
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], marker="*", linewidth=2.6, label="lead: stops, route", **star)
-    ]
-    for i, name in enumerate(names):
-        marker = MARKERS[i % len(MARKERS)]
-        style = _filled(ROBOTS[i % len(ROBOTS)])
-        label = f"{name}: post, route"
-        handles.append(Line2D([], [], marker=marker, linestyle=_DASHED, label=label, **style))
-    return [
-        *handles,
-        Line2D([], [], marker="o", linestyle="none", label="next post", **_open(GREY)),
-        Line2D([], [], color=GREY, linewidth=0.8, label="sight line"),
-        Patch(facecolor=VEGETATION, label="vegetation"),
-    ]
+    lines.append({"marker": "o", "linestyle": "none", "label": "next post", **_open(GREY)})
+    lines.append({"color": GREY, "linewidth": 0.8, "label": "sight line"})
+    return [Line2D([], [], **line) for line in lines]
 
 
 def _filled(colour: str, size: float = 6.0) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import cycle
 from typing import Any
 
 import matplotlib as mpl
@@ -14,7 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import AutoLocator, MaxNLocator
+from matplotlib.ticker import AutoLocator
+from matplotlib.transforms import Bbox
 
 from trustbo.errors import TrustboError
 
@@ -58,8 +60,6 @@ N_INTERVALS = 5
 The number does not depend on the size of the axes: Matplotlib computes the layout first, and labels
 of other ticks that it chose afterwards could be cut off.
 """
-_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
-"""Steps between ticks, up to a power of ten."""
 _LETTERS = 15.0
 """Number of letters of an axis label per inch, a little less than fit."""
 _BROAD = 1.5
@@ -105,55 +105,50 @@ def panels(
     Raises:
         TrustboError: `ax` has too few axes, or contains other objects.
     """
-    if ax is not None:
-        given = np.asarray(ax, dtype=object).ravel()
-        if len(given) < n or not all(isinstance(panel, Axes) for panel in given):
+    if ax is None:
+        axes = _new_axes(n, size, min(n, columns), shared)
+    else:
+        axes = np.asarray(ax, dtype=object).ravel()
+        if len(axes) < n or not all(isinstance(panel, Axes) for panel in axes):
             raise TrustboError(f"ax must have at least {n} Axes, one per panel; got {ax!r:.80}.")
-        for panel in given[:n]:  # the font sizes of the user's axes may differ
-            panel.tick_params(labelsize=RC["xtick.labelsize"])
-            for text in (panel.xaxis.label, panel.yaxis.label):
-                text.set_size(RC["axes.labelsize"])
-            panel.set_prop_cycle(None)  # the user's cycle may set markers and line styles
-            _choose_ticks(panel)
-        return given[:n]
 
-    cols = min(n, columns)
-    rows = math.ceil(n / cols)
-    width = min(cols * size[0], PAGE)
-    height = rows * size[1] * width / (cols * size[0])
+    for panel in axes[:n]:  # the font sizes of the user's axes may differ
+        panel.tick_params(labelsize=RC["xtick.labelsize"])
+        panel.set_prop_cycle(None)  # the user's cycle may set markers and line styles
+        for axis in (panel.xaxis, panel.yaxis):
+            axis.label.set_size(RC["axes.labelsize"])
+            locator = axis.get_major_locator()
+            if isinstance(locator, AutoLocator):
+                locator.set_params(nbins=N_INTERVALS)
+    return axes[:n]
 
-    _, axes = plt.subplots(
-        rows, cols, figsize=(width, height), squeeze=False, layout="compressed", **shared
+
+def _new_axes(n: int, size: tuple[float, float], columns: int, shared: Any) -> np.ndarray:
+    """Return n axes of a new figure that fits on a page; see `panels`."""
+    rows = math.ceil(n / columns)
+    width = min(columns * size[0], PAGE)
+    height = rows * size[1] * width / (columns * size[0])
+    _, grid = plt.subplots(
+        rows, columns, figsize=(width, height), squeeze=False, layout="compressed", **shared
     )
 
-    for unused in axes.ravel()[n:]:
+    axes = grid.ravel()
+    for unused in axes[n:]:
         unused.remove()
-    for panel in axes.ravel()[:n]:
-        _choose_ticks(panel)
-    return axes.ravel()[:n]
+    return axes[:n]
 
 
-def _choose_ticks(panel: Axes) -> None:
-    """Replace Matplotlib's default choice of ticks, which depends on the size of the axes."""
-    for axis in (panel.xaxis, panel.yaxis):
-        if type(axis.get_major_locator()) is AutoLocator:
-            axis.set_major_locator(round_ticks())
-
-
-def round_ticks() -> MaxNLocator:
-    """Return a choice of ticks at round numbers, which does not depend on the size of the axes."""
-    return MaxNLocator(N_INTERVALS, steps=_STEPS)
+def robot_looks(names: Iterable[str]) -> Iterator[tuple[str, str, str]]:
+    """Yield the name, the colour and the marker of each robot."""
+    return zip(names, cycle(ROBOTS), cycle(MARKERS), strict=False)
 
 
 def in_lines(label: str, axes: Sequence[Axes] | np.ndarray) -> str:
     """Break the label of a vertical axis beside axes into lines that are shorter than these."""
-    low = min(panel.get_position().y0 for panel in axes)
-    high = max(panel.get_position().y1 for panel in axes)
-    most = int(_LETTERS * figure_of(axes).get_figheight() * (high - low))
-    lines = (
-        textwrap.wrap(line, max(most, 1), break_long_words=False) for line in label.split("\n")
-    )
-    return "\n".join(part for parts in lines for part in parts)
+    height = Bbox.union([panel.get_position() for panel in axes]).height  # of the figure
+    most = max(int(_LETTERS * figure_of(axes).get_figheight() * height), 1)
+    lines = label.split("\n")
+    return "\n".join(textwrap.fill(line, most, break_long_words=False) for line in lines)
 
 
 def figure_of(axes: Sequence[Axes] | np.ndarray) -> Figure:
@@ -161,6 +156,11 @@ def figure_of(axes: Sequence[Axes] | np.ndarray) -> Figure:
     figure = axes[0].get_figure(root=True)
     assert isinstance(figure, Figure)  # noqa: S101
     return figure
+
+
+def handles_of(panel: Axes) -> list[Any]:
+    """Return the labelled lines and areas of a panel, for a legend."""
+    return panel.get_legend_handles_labels()[0]
 
 
 def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
@@ -172,7 +172,7 @@ def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
     if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
         most = 4 if figure.get_figwidth() >= _WIDE else 2
         columns = min(len(handles), most)
-        figure.legend(handles=list(handles), loc="outside lower center", ncols=columns)
+        figure.legend(handles=handles, loc="outside lower center", ncols=columns)
     elif is_broad(axes[0]):
         axes[0].legend(handles=list(handles))
 
@@ -184,9 +184,7 @@ def is_broad(panel: Axes) -> bool:
 
 def accent() -> str:
     """Return the colour of a single curve: a light blue on dark backgrounds, else a dark blue."""
-    red, green, blue = to_rgb(background())
-    brightness = 0.3 * red + 0.6 * green + 0.1 * blue
-    return ROBOTS[4] if brightness < 0.5 else ROBOTS[0]
+    return ROBOTS[4] if np.mean(to_rgb(background())) < 0.5 else ROBOTS[0]
 
 
 def ink() -> str:
