@@ -11,7 +11,9 @@ from arviz_stats.utils import ELPDData
 
 from trustbo.errors import TrustboError, one_line
 from trustbo.inference.learner import Model
-from trustbo.inference.loo import LeftOut, estimated, left_out
+from trustbo.inference.loo import complete, estimated
+from trustbo.inference.tree import LIKELIHOOD_OF, RATES
+from trustbo.models.families import FAMILIES
 from trustbo.parallel import computing
 
 _LEAST_DIFFERENCE = 4.0
@@ -77,12 +79,16 @@ def compare(
     if unknown:
         raise TrustboError(f"models has {unknown[0]!r}, but there is no posterior of this name.")
 
-    targets = {}
-    for name, tree in posteriors.items():
-        targets[name] = left_out(f"compare of {name!r}", tree, (models or {}).get(name))
-    _require_same_data(targets)
+    model_of = models or {}
+    whole = {
+        name: complete(f"compare of {name!r}", tree, model_of.get(name))
+        for name, tree in posteriors.items()
+    }
+    _require_same_data(whole)
 
-    found = {name: estimated(target, progress=progress) for name, target in targets.items()}
+    found = {
+        name: estimated(tree, model_of.get(name), progress=progress) for name, tree in whole.items()
+    }
     table = ranked(found, round_to=round_to)  # pyright: ignore[reportArgumentType]
     after_p = table.columns.get_loc("p") + 1  # pyright: ignore[reportOperatorIssue]
     table.insert(after_p, "n_missions", [found[name].n_data_points for name in table.index])
@@ -90,33 +96,44 @@ def compare(
     return table
 
 
-def _require_same_data(targets: Mapping[str, LeftOut]) -> None:
+def _require_same_data(posteriors: Mapping[str, xr.DataTree]) -> None:
     """Raise TrustboError unless all log-likelihoods refer to the same data."""
-    first, *others = targets
-    reference = targets[first]
+    first, *others = posteriors
+    reference = _data_of(posteriors[first])
     for name in others:
-        one = targets[name]
-        order = list(range(one.contact_rate.shape[-1]))
-        if one.robots and sorted(one.robots) == sorted(reference.robots):
-            order = [one.robots.index(robot) for robot in reference.robots]
+        data = _data_of(posteriors[name])
+        if "robot" in data.coords and "robot" in reference.coords:
+            robots = reference["robot"].values
+            if set(robots) == set(data["robot"].values):
+                data = data.sel(robot=robots)
 
-        pairs = [(reference.contact_rate, one.contact_rate[..., order])]
-        if reference.n_ticks is not None and one.n_ticks is not None:
-            pairs.append((reference.n_ticks, one.n_ticks[..., order]))
-        for a, b in pairs:
+        for variable in {RATES, "n_ticks"} & set(data) & set(reference):
+            a = reference[variable].values
+            b = data[variable].values
             if a.shape != b.shape or not np.allclose(a, b, rtol=0.0, atol=_SINGLE, equal_nan=True):
                 raise TrustboError(
                     f"{name!r} and {first!r} were fitted to different rates or tick counts, of "
                     f"shape {b.shape} and {a.shape}; fit both to the same missions."
                 )
 
-        if (reference.is_density != one.is_density[..., order]).any():
-            dense, other = (first, name) if reference.is_density.any() else (name, first)
+        if (reference["is_density"].values != data["is_density"].values).any():
+            dense, other = (first, name) if reference["is_density"].any() else (name, first)
             raise TrustboError(
                 f"the log-likelihoods of {dense!r} are densities of rates, and those of {other!r} "
                 "are, at least for some rates, probabilities, so they cannot be compared; give all "
                 "missions n_ticks and, in a NumPyro function, ContactRate(..., n_ticks=n_ticks)."
             )
+
+
+def _data_of(posterior: xr.DataTree) -> xr.Dataset:
+    """Return the rates, their tick counts if known, and whether likelihoods are densities."""
+    data = posterior["observed_data"].to_dataset()[[RATES]]
+    family = FAMILIES[posterior.attrs.get("family", "gaussian")]
+    of_rates = posterior.attrs[LIKELIHOOD_OF] == RATES
+    is_density = data[RATES].notnull() & family.is_density(data[RATES].values) & of_rates
+    if "constant_data" in posterior.children:
+        data = data.assign(n_ticks=posterior["constant_data"].to_dataset()["n_ticks"])
+    return data.assign(is_density=is_density)
 
 
 def _verdicts(found: Mapping[str, ELPDData], names: list[str]) -> list[str]:
