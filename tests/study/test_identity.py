@@ -9,6 +9,7 @@ from functools import cached_property, lru_cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 import pytest
 
 import trustbo as tb
@@ -87,6 +88,7 @@ def test_functions_that_call_themselves_and_each_other_have_an_identity():
     [
         Policy(), tb.models.PooledTrust(), {"b": 1, "a": {2.0, 3.0}}, jax.jit(defined()), jnp.tanh,
         jax.random.key(0), np.arange(3), cached, tb.terrain, partial(Policy, weight=1.0),
+        jax.nn.relu, jax.vmap(jnp.tanh), jnp.vectorize(jnp.tanh), dist.LogNormal(0.0, 1.0),
     ],
 )  # fmt: skip
 def test_options_of_all_kinds_have_an_identity(value):
@@ -101,6 +103,10 @@ def test_objects_differ_by_their_values_and_by_their_class(monkeypatch):
         assert identity(Policy()) != expected
     monkeypatch.setattr(Policy, "__call__", lambda self, rng, draws, planner: 0.0)
     assert identity(Policy()) != expected
+
+
+def test_functions_of_packages_differ_by_the_values_that_they_enclose():
+    assert identity(jax.vmap(defined())) != identity(jax.vmap(defined(added=2)))
 
 
 def test_objects_stay_the_same_when_they_are_used():

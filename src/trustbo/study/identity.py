@@ -18,7 +18,7 @@ def identity_of(name: str, value: Any) -> str:
     """Return a hash of a named case or scene, and of all values and code to which it refers.
 
     Functions and classes of the user's files are identified by their byte code, which has no
-    comments, and those of installed packages and of modules by their names.
+    comments, and those of installed packages by their names and the values that they enclose.
 
     Raises:
         TrustboError: A value cannot be pickled.
@@ -50,7 +50,7 @@ class _Hasher(NumpyHasher):
         if isinstance(value, FunctionType | type) and _is_editable(value):
             return str, (value.__qualname__,), _used_by(value)
         if isinstance(value, FunctionType):
-            return str, (f"{value.__module__}.{value.__qualname__}",)
+            return str, (f"{value.__module__}.{value.__qualname__}",), _enclosed(value)
 
         wrapped = getattr(value, "__wrapped__", None)  # such as that of `jax.jit`
         return _without_cache(value) if wrapped is None else (list, ([type(value), wrapped],))
@@ -58,10 +58,12 @@ class _Hasher(NumpyHasher):
 
 def _is_editable(value: Callable[..., Any]) -> bool:
     """Return whether a function or class is of a file or notebook of the user."""
-    module = value.__module__ or ""
+    module = value.__module__ or "__main__"
+    package = module.partition(".")[0]
     file = getattr(sys.modules.get(module), "__file__", None) or ""
-    is_installed = {"site-packages", "dist-packages"} & {*Path(file).parts}
-    return not is_installed and module.split(".")[0] not in {"trustbo", *sys.stdlib_module_names}
+    is_installed = not {"site-packages", "dist-packages"}.isdisjoint(Path(file).parts)
+    is_known = is_installed or package in {"trustbo", *sys.stdlib_module_names}
+    return module == "__main__" or not is_known
 
 
 def _used_by(value: Any) -> list[Any]:
@@ -77,8 +79,13 @@ def _used_by(value: Any) -> list[Any]:
 
     names = sorted(_names_in(value.__code__) & set(value.__globals__))
     of_globals = {name: value.__globals__[name] for name in names}
-    enclosed = [cell.cell_contents for cell in value.__closure__ or ()]
-    return [value.__code__, value.__defaults__, value.__kwdefaults__, enclosed, of_globals]
+    defaults = (value.__defaults__, value.__kwdefaults__)
+    return [value.__code__, defaults, _enclosed(value), of_globals]
+
+
+def _enclosed(function: FunctionType) -> list[Any]:
+    """Return the values of the variables of the functions that enclose a function."""
+    return [cell.cell_contents for cell in function.__closure__ or ()]
 
 
 def _names_in(code: CodeType) -> set[str]:
