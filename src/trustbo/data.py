@@ -358,12 +358,15 @@ class Mission(Summary):
 
         lacks = {*unmeasured} - {*self.features}
         own = (*self.features, *lacks.intersection(features))
-        if sorted(robots) != sorted(self.robots) or sorted(features) != sorted(own):
-            raise TrustboError(
-                f"the mission has robots {self.robots} and features {self.features}, not "
-                f"{tuple(robots)} and {tuple(features)}; rename them, or use a workspace with "
-                "these names."
-            )
+        for what, known, wanted in (
+            ("robots", self.robots, robots),
+            ("features", own, features),
+        ):
+            if sorted(known) != sorted(wanted):
+                raise TrustboError(
+                    f"the mission has {what} {getattr(self, what)}, not {tuple(wanted)}; rename "
+                    "them, or use a workspace with these names."
+                )
 
         i = [self.robots.index(name) for name in robots]
         members = [0, *(1 + j for j in i)]  # the lead is first
