@@ -8,6 +8,16 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_list, require_order, warn
 
 
+def padded(arrays: Sequence[np.ndarray], fill: float) -> np.ndarray:
+    """Return arrays (bound, ...) of missions as one (mission, bound, ...), padded with `fill`."""
+    n_bounds = max(len(values) for values in arrays)
+    shape = (len(arrays), n_bounds, *arrays[0].shape[1:])
+    whole = np.full(shape, fill, dtype=arrays[0].dtype)
+    for values, of_mission in zip(arrays, whole, strict=True):
+        of_mission[: len(values)] = values
+    return whole
+
+
 def known_awareness(missions: Sequence[Mission]) -> list[int]:
     """Return the indices of the missions whose awareness is known in all bounds.
 

@@ -20,6 +20,7 @@ from trustbo.models.effects.effect import Effect
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.observations import Observations
 from trustbo.models.scores import log_density
+from trustbo.stacking import padded
 from trustbo.streams import stream
 
 LIKELIHOOD_OF = "log_likelihood_of"
@@ -142,12 +143,9 @@ def _data_groups(
     observed: Observations, missions: Sequence[Mission], coords: dict[str, object]
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Build the groups `observed_data` and `constant_data`."""
-    shape = observed.contact_rate.shape
-    duration = np.full(shape, np.nan)
-    cell = np.full((*shape[:2], 2), -1)
-    for j, mission in enumerate(missions):
-        duration[j, : len(mission.bounds)] = mission.duration
-        cell[j, : len(mission.bounds)] = [bound.cell for bound in mission.bounds]
+    duration = padded([mission.duration for mission in missions], np.nan)
+    cells = [np.array([bound.cell for bound in mission.bounds]) for mission in missions]
+    cell = padded(cells, -1)
     starts = [mission.path[0] if mission.path else NOWHERE for mission in missions]
 
     # The number of bounds follows from the cells, except for missions without a map.

@@ -9,7 +9,7 @@ from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError
 from trustbo.models.families import Family
 from trustbo.models.visited import Visited
-from trustbo.stacking import require_same_team
+from trustbo.stacking import padded, require_same_team
 from trustbo.statespace.matrices import namespace
 
 NO_TICKS = (
@@ -44,16 +44,6 @@ class Observations(NamedTuple):
                 an awareness value is NaN; only contact rates may be missing.
         """
         missions = require_same_team(missions)
-        n_bounds = max(len(mission.bounds) for mission in missions)
-        _, n_robots, n_features = missions[0].awareness.shape
-        shape = len(missions), n_bounds, n_robots
-        padded = cls(
-            contact_rate=np.full(shape, np.nan),
-            awareness=np.zeros((*shape, n_features)),
-            n_ticks=np.full(shape, np.nan),
-            features=tuple(missions[0].features),
-        )
-
         for j, mission in enumerate(missions):
             unknown = np.argwhere(np.isnan(mission.awareness))
             if len(unknown):
@@ -64,12 +54,12 @@ class Observations(NamedTuple):
                     "mission if the map does not know the cell."
                 )
 
-            driven = slice(len(mission.bounds))
-            padded.contact_rate[j, driven] = mission.contact_rate
-            padded.awareness[j, driven] = mission.awareness
-            padded.n_ticks[j, driven] = mission.n_ticks
-
-        return padded
+        return cls(
+            contact_rate=padded([mission.contact_rate for mission in missions], np.nan),
+            awareness=padded([mission.awareness for mission in missions], 0.0),
+            n_ticks=padded([mission.n_ticks for mission in missions], np.nan),
+            features=missions[0].features,
+        )
 
     @property
     def n_missions(self) -> int:

@@ -7,6 +7,7 @@ import numpy as np
 
 from trustbo.data import Mission, require_map
 from trustbo.errors import TrustboError
+from trustbo.stacking import padded
 from trustbo.workspace.moves import bounds_along
 
 _MOST = 4000  # maximum number of visited bounds, because the cost grows with its cube
@@ -34,28 +35,23 @@ class Visited(NamedTuple):
         return visited(bounds, self.shape, self.bound_map[at[:, 0, 0]])
 
 
-def bounds_of(missions: Sequence[Mission], shape: tuple[int, int] | None = None) -> np.ndarray:
+def bounds_of(missions: Sequence[Mission]) -> np.ndarray:
     """Return an array (mission, bound, 3) of moves, rows and columns, with -1 in the padding.
 
-    `shape` contains the numbers of missions and bounds; the default is that of `missions`. Raises
-    TrustboError if a path skips cells or a mission has no map.
+    Raises TrustboError if a path skips cells or a mission has no map.
     """
     require_map("a model with place effects", missions)
-    if shape is None:
-        shape = len(missions), max(len(mission.bounds) for mission in missions)
-
-    bounds = np.full((*shape, 3), -1)
+    bounds = []
     for j, mission in enumerate(missions):
-        path = mission.path[: len(mission.bounds) + 1]  # failed missions do not complete the path
         try:
-            bounds[j, : len(mission.bounds)] = bounds_along(path)
+            bounds.append(bounds_along(mission.driven))
         except TrustboError as error:
             raise TrustboError(
                 f"mission {j}: {error} A model with place effects needs paths without jumps; omit "
                 "PlaceEffect(), or split the mission at the jump."
             ) from None
 
-    return bounds
+    return padded(bounds, -1)
 
 
 def has_places(missions: Sequence[Mission]) -> bool:

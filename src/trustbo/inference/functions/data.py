@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from trustbo import stacking
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.models.observations import Observations
@@ -57,31 +58,26 @@ def data_of(
     NaN, because a NaN drift would make gradients NaN even in bounds without rates. If `moves` is
     False, all moves are -1, and paths may jump; otherwise, a jump raises a TrustboError.
     """
-    n_missions, n_bounds = observations.contact_rate.shape[:2]
-    n_ticks = np.zeros(observations.contact_rate.shape)
-    duration = np.zeros(observations.contact_rate.shape)
-    bound = np.full((n_missions, n_bounds, 3), _UNKNOWN)
-    for j, mission in enumerate(missions):
-        driven = slice(len(mission.bounds))
-        n_ticks[j, driven] = mission.n_ticks
-        duration[j, driven] = mission.duration
-        if mission.path:
-            path = mission.path[: len(mission.bounds) + 1]  # failed missions do not complete it
-            bound[j, driven, 1:] = path[1:]
-            if moves:
-                bound[j, driven] = bounds_along(path)
+    bounds = []
+    for mission in missions:
+        if moves and mission.path:
+            bounds.append(bounds_along(mission.driven))
+        else:
+            cells = [bound.cell for bound in mission.bounds]  # -1 without a map
+            bounds.append(np.insert(cells, 0, _UNKNOWN, axis=1))
 
-    data = {
-        "awareness": observations.awareness,
-        RATES: observations.contact_rate,
-        "n_ticks": n_ticks,
-        "duration": duration,
-        "cell": bound[..., 1:],
-        "bound": bound,
-        "features": tuple(missions[0].features),
-    }
-    shape = _power_of_two(n_missions), n_bounds + -n_bounds % _STEP_OF_BOUNDS
-    return padded(data, shape)
+    data = _inputs_of(
+        observations.awareness,
+        stacking.padded(bounds, _UNKNOWN),
+        observations.features,
+        {
+            RATES: observations.contact_rate,
+            "n_ticks": stacking.padded([mission.n_ticks for mission in missions], 0.0),
+            "duration": stacking.padded([mission.duration for mission in missions], 0.0),
+        },
+    )
+    n_missions, n_bounds = observations.contact_rate.shape[:2]
+    return padded(data, (_power_of_two(n_missions), _rounded_up(n_bounds)))
 
 
 def padded(data: Data, shape: tuple[int, int]) -> dict[str, Any]:
@@ -95,50 +91,40 @@ def padded(data: Data, shape: tuple[int, int]) -> dict[str, Any]:
 
 
 def data_of_bounds(
-    awareness: np.ndarray, bounds: np.ndarray, features: Sequence[str]
+    awareness: np.ndarray, bounds: np.ndarray, features: Sequence[str], *, measured: bool = False
 ) -> dict[str, Any]:
-    """Return the inputs of bounds as one mission without contact rates, padded as in `data_of`.
-
-    The number of ticks and the duration, which are not known before a mission, are NaN.
+    """Return the inputs of bounds as one mission, padded as in `data_of`.
 
     Args:
         awareness: Awareness, shape (bound, robot, feature), without NaN.
         bounds: Moves, rows and columns, shape (bound, 3).
         features: Names of the features.
+        measured: Whether to invent contact rates, numbers of ticks and durations for several
+            missions. By default, these are NaN, because they are not known before a mission.
     """
-    n_bounds, n_robots, n_features = awareness.shape
-    n_padded = n_bounds + -n_bounds % _STEP_OF_BOUNDS
+    n_bounds, n_robots, _ = awareness.shape
+    measurements = {
+        name: np.full((1, n_bounds, n_robots), value if measured else np.nan)
+        for name, value in _IN_EXAMPLE.items()
+    }
+    data = _inputs_of(awareness[None], bounds[None], features, measurements)
+    return padded(data, (_FEWEST_MISSIONS if measured else 1, _rounded_up(n_bounds)))
 
-    z = np.zeros((1, n_padded, n_robots, n_features))
-    z[0, :n_bounds] = awareness
-    indices = np.full((1, n_padded, 3), _UNKNOWN)
-    indices[0, :n_bounds] = bounds
-    unmeasured = np.full((1, n_padded, n_robots), np.nan)
 
+def _inputs_of(
+    awareness: np.ndarray,
+    bounds: np.ndarray,
+    features: Sequence[str],
+    measurements: dict[str, np.ndarray],
+) -> dict[str, Any]:
+    """Return the inputs by name, without padding."""
     return {
-        "awareness": z,
-        RATES: unmeasured,
-        "n_ticks": unmeasured,
-        "duration": unmeasured,
-        "cell": indices[..., 1:],
-        "bound": indices,
+        "awareness": awareness,
+        **measurements,
+        "cell": bounds[..., 1:],
+        "bound": bounds,
         "features": tuple(features),
     }
-
-
-def data_of_example(
-    awareness: np.ndarray, bounds: np.ndarray, features: Sequence[str]
-) -> dict[str, Any]:
-    """Return the inputs of an invented mission with measurements in some bounds, padded.
-
-    For the arguments, see `data_of_bounds`.
-    """
-    data = data_of_bounds(awareness, bounds, features)
-    for name, value in _IN_EXAMPLE.items():
-        measured = np.full(data[name].shape, _IN_PADDING[name])
-        measured[:, : len(bounds)] = value
-        data[name] = measured
-    return padded(data, (_FEWEST_MISSIONS, data[RATES].shape[1]))
 
 
 def observations_of(data: Data) -> Observations:
@@ -164,6 +150,11 @@ def require_same_order(
                 f"not {', '.join(names)}. A function reads them by position, so give the same "
                 "names in the same order."
             )
+
+
+def _rounded_up(n_bounds: int) -> int:
+    """Return the number of bounds with their padding."""
+    return n_bounds + -n_bounds % _STEP_OF_BOUNDS
 
 
 def _power_of_two(n: int) -> int:

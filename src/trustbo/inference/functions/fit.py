@@ -26,7 +26,6 @@ from trustbo.inference.functions.data import (
     arrays_of,
     data_of,
     data_of_bounds,
-    data_of_example,
     observations_of,
 )
 from trustbo.inference.functions.draws import (
@@ -417,7 +416,7 @@ def require_learnable(model: FunctionModel, workspace: Workspace, *, by_gradient
     awareness = workspace.awareness.values
     z = np.moveaxis(awareness, 0, -2)  # (move, row, col, robot, feature)
     known = np.argwhere(~np.isnan(z).any((-2, -1)))[:_INVENTED]
-    data = data_of_example(z[tuple(known.T)], known, workspace.features)
+    data = data_of_bounds(z[tuple(known.T)], known, workspace.features, measured=True)
     if model.needs_observations:
         data["observations"] = observations_of(data)
     sites = model.sites(data)

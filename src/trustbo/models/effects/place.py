@@ -91,8 +91,8 @@ class PlaceEffect(Effect):
     ) -> Observations:
         """See `Effect.add_data`; adds the visited places."""
         shape: Any = None if on is None else on.passable.shape
-        bounds = bounds_of(missions, observations.contact_rate.shape[:2])
-        return observations._replace(visited=visited(bounds, shape, maps_of(missions)))
+        places = visited(bounds_of(missions), shape, maps_of(missions))
+        return observations._replace(visited=places)
 
     def design(self, observations: Observations) -> Any:
         """Return indicator columns of the cells entered and of the directed bounds.
