@@ -1,11 +1,62 @@
-"""Checks of missions that are to be fitted together."""
+"""Missions that are to be fitted together: the same robots and features, in one array each."""
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_list, require_order, warn
+from trustbo.errors import TrustboError, require_kind, require_list, require_order, warn
+from trustbo.workspace import Workspace
+
+
+def prepare(
+    missions: Iterable[Mission],
+    workspace: Workspace | None = None,
+    earlier: Iterable[Mission] = (),
+) -> tuple[list[Mission], tuple[str, ...]]:
+    """Prepare missions for a fit; see `trustbo.fit` for the arguments.
+
+    Returns:
+        All missions, with the same robots and features, starting with those of earlier campaigns;
+        and the robots of the other missions.
+
+    Raises:
+        TrustboError: There are no missions, or their robots or features differ.
+    """
+    earlier = list_of_missions(earlier, "earlier")
+    filled, known = fill(missions, workspace)
+    own = [filled[j] for j in known]
+    if not earlier:
+        return require_same_team(own), own[0].robots
+
+    if own:
+        robots = require_same_team(own)[0].robots
+    else:
+        robots = earlier[0].robots if workspace is None else workspace.team.names
+    return require_same_team(pooled(robots, [*earlier, *own])), robots
+
+
+def fill(
+    missions: Iterable[Mission], workspace: Workspace | None
+) -> tuple[list[Mission], list[int]]:
+    """Fill in the awareness of the map where missions have none; see `Workspace.fill`.
+
+    Returns:
+        The missions, and the indices of those whose awareness is known in all bounds. The others
+        are named in a warning, as in `Campaign.tell`, which excludes them. Without a workspace,
+        all missions are returned as they are.
+    """
+    missions = list_of_missions(missions)
+    indices = list(range(len(missions)))
+    if workspace is None:
+        return missions, indices
+
+    require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
+    filled = [workspace.fill(mission) for mission in missions]
+    unknown = [j for j in indices if np.isnan(filled[j].awareness).any()]
+    if unknown:
+        warn(f"missions {unknown} are left out: the map has no awareness in some of their cells.")
+    return filled, [j for j in indices if j not in unknown]
 
 
 def padded(arrays: Sequence[np.ndarray], fill: float) -> np.ndarray:
@@ -16,19 +67,6 @@ def padded(arrays: Sequence[np.ndarray], fill: float) -> np.ndarray:
     for values, of_mission in zip(arrays, whole, strict=True):
         of_mission[: len(values)] = values
     return whole
-
-
-def known_awareness(missions: Sequence[Mission]) -> list[int]:
-    """Return the indices of the missions whose awareness is known in all bounds.
-
-    Call this function after the awareness of the map has been filled in. The other missions are
-    named in a warning, as in `Campaign.tell`, which excludes them.
-    """
-    known = [j for j, mission in enumerate(missions) if not np.isnan(mission.awareness).any()]
-    unknown = sorted({*range(len(missions))} - {*known})
-    if unknown:
-        warn(f"missions {unknown} are left out: the map has no awareness in some of their cells.")
-    return known
 
 
 def names_of_all(robots: Sequence[str], missions: Sequence[Mission]) -> tuple[str, ...]:

@@ -47,7 +47,7 @@ def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Missio
     try:
         known = workspace.along(mission.path, anywhere=True)[: len(mission.bounds)]
     except TrustboError as error:
-        if any(bound.status != "ok" for bound in mission.bounds[:-1]):
+        if any(status != "ok" for status in mission.bound_status[:-1]):
             raise TrustboError(
                 f"{error} A lead that did not reach the cell of a bound that failed has to drive a "
                 "bound back before the next one."

@@ -52,13 +52,7 @@ from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_to_record
 from trustbo.models.visited import has_places
 from trustbo.parallel import computing
-from trustbo.stacking import (
-    known_awareness,
-    list_of_missions,
-    pooled,
-    require_same_robots,
-    require_same_team,
-)
+from trustbo.stacking import list_of_missions, prepare, require_same_robots
 from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
@@ -152,7 +146,7 @@ def fit(
     """
     started = time.perf_counter()
     earlier = list_of_missions(earlier, "earlier")
-    missions, robots = _joined(list_of_missions(missions), earlier, workspace)
+    missions, robots = prepare(missions, workspace, earlier)
     start = _same_names(start, missions[0])
     if model is None:
         scale = missions[0].scale  # empty unless the missions are people's reports
@@ -247,31 +241,6 @@ def require_poolable_with_model(
     """
     if model.joint and not model.exchangeable:
         require_same_robots(type(model).__name__, earlier, robots)
-
-
-def _joined(
-    missions: list[Mission], earlier: list[Mission], workspace: Workspace | None
-) -> tuple[list[Mission], tuple[str, ...]]:
-    """Return all missions, earlier ones first, and the robots of those that are not earlier."""
-    if missions or not earlier:
-        require_same_team(missions)
-    if workspace is not None:
-        require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
-        missions = [workspace.fill(mission) for mission in missions]
-        missions = [missions[j] for j in known_awareness(missions)]
-        if not earlier:
-            require_same_team(missions)  # also raises an error if none is left
-
-    if missions:
-        robots = missions[0].robots
-    else:
-        robots = earlier[0].robots if workspace is None else workspace.team.names
-    if not earlier:
-        return missions, robots
-
-    missions = pooled(robots, [*earlier, *missions])
-    require_same_team(missions)
-    return missions, robots
 
 
 def _label_earlier(tree: xr.DataTree, n_earlier: int, others: Sequence[str]) -> None:

@@ -6,12 +6,12 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_kind, require_whole
+from trustbo.errors import TrustboError, require_whole
 from trustbo.inference.draws import QUANTILES, as_fitted, in_order_of
 from trustbo.inference.filter import TrustFilter
 from trustbo.models.observations import Observations, require_ticks
 from trustbo.parallel import computing
-from trustbo.stacking import known_awareness, list_of_missions
+from trustbo.stacking import fill, list_of_missions, require_same_team
 from trustbo.statespace import kalman
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
@@ -83,13 +83,7 @@ def score(
     require_whole("seed", seed, 0)
     if missions is None and isinstance(posterior, Posteriors):
         missions = posterior.missions
-    missions = list_of_missions(() if missions is None else missions)
-
-    known = range(len(missions))
-    if workspace is not None:
-        require_kind("workspace", workspace, Workspace, "give the workspace of the missions")
-        missions = [workspace.fill(mission) for mission in missions]
-        known = known_awareness(missions)
+    missions, known = fill(() if missions is None else missions, workspace)
 
     trees, indices = predictions("score", posterior, missions, known)
     if not trees:
@@ -98,7 +92,7 @@ def score(
             "missions has one. Run more missions."
         )
 
-    missions = [missions[j] for j in indices]
+    missions = require_same_team(missions[j] for j in indices)
     observations = Observations.from_missions(missions)
     y = observations.contact_rate
     robots = missions[0].robots  # the same for all missions, as are the features

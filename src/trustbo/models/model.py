@@ -22,7 +22,7 @@ from trustbo.models.families import FAMILIES, Family
 from trustbo.models.observations import Observations, require_ticks
 from trustbo.models.priors import Priors, as_text
 from trustbo.models.scores import NormalScores
-from trustbo.stacking import list_of_missions
+from trustbo.stacking import require_same_team
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.statespace.blocks import Layout, LinearPredictor
 from trustbo.statespace.matrices import namespace
@@ -226,7 +226,7 @@ class TrustModel(Summary, ABC):
                 awareness value is NaN; a measured rate lacks the n_ticks that the family needs; or
                 a path jumps or leaves the workspace.
         """
-        missions = list_of_missions(missions)
+        missions = require_same_team(missions)
         observations = Observations.from_missions(missions)
         require_ticks(self.likelihood, observations.contact_rate, observations.n_ticks)
         for effect in self.effects:

@@ -1,6 +1,6 @@
 """Contact rates and awareness of missions, padded to one array each."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -9,7 +9,7 @@ from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError
 from trustbo.models.families import Family
 from trustbo.models.visited import Visited
-from trustbo.stacking import padded, require_same_team
+from trustbo.stacking import padded
 from trustbo.statespace.matrices import namespace
 
 NO_TICKS = (
@@ -36,14 +36,12 @@ class Observations(NamedTuple):
     """Places of the bounds, or None if no effect needs them."""
 
     @classmethod
-    def from_missions(cls, missions: Iterable[Mission]) -> Self:
-        """Pad missions with the same robots and features, of any length.
+    def from_missions(cls, missions: Sequence[Mission]) -> Self:
+        """Pad missions of any length with the same robots and features; see `require_same_team`.
 
         Raises:
-            TrustboError: If there are no missions, robots or features differ between missions, or
-                an awareness value is NaN; only contact rates may be missing.
+            TrustboError: If an awareness value is NaN; only contact rates may be missing.
         """
-        missions = require_same_team(missions)
         for j, mission in enumerate(missions):
             unknown = np.argwhere(np.isnan(mission.awareness))
             if len(unknown):

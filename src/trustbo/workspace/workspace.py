@@ -322,8 +322,7 @@ class Workspace(Summary):
         if not missing.any():
             return ordered
 
-        driven = ordered.path[: len(missing) + 1]
-        known = self.along(driven, anywhere=True)
+        known = self.along(ordered.driven, anywhere=True)
         return ordered.with_awareness(np.where(missing, known, ordered.awareness))
 
     def locate(self, location: Location, what: str = "location") -> Cell:
