@@ -14,7 +14,7 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.errors import TrustboError, composed, one_line, require_order
+from trustbo.errors import TrustboError, composed, one_line, require_list, require_order
 
 _NUMERIC = "biufO"
 """Kinds of dtypes that may hold real numbers."""
@@ -210,13 +210,7 @@ def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:
     They must have an order, so a set is refused. If `n` is given, there must be none or `n` of
     them.
     """
-    require_order(what, given)
-    is_scalar = isinstance(given, str | bytes) or getattr(given, "ndim", 1) == 0
-    listed = isinstance(given, Iterable) and not is_scalar
-    names = tuple(given) if listed else ()
-    if not listed or not all(isinstance(name, str) for name in names):
-        raise TrustboError(f"{what} must be a list of names; got {one_line(given)}.")
-
+    names = tuple(require_list(what, require_order(what, given), str, "give a list of names"))
     if len(set(names)) < len(names) or (names and n not in (None, len(names))):
         many = "" if n is None else f"{n} "
         raise TrustboError(f"{what} must be {many}different names; got {names}.")
