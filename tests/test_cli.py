@@ -1,5 +1,6 @@
 """Commands: what they write, how they fail, and that their help imports nothing heavy."""
 
+import io
 import re
 import subprocess
 import sys
@@ -134,6 +135,20 @@ def test_a_missing_file_is_an_error_of_one_line(words, capsys, tmp_path, monkeyp
     assert call(*words) == 2
     assert capsys.readouterr().err.startswith("error: ")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["stdout", "stderr"])
+def test_paths_with_letters_that_the_terminal_lacks_are_printed(
+    name, campaign, tmp_path, monkeypatch
+):
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, name, io.TextIOWrapper(written, "cp1252", write_through=True))
+    folder = tmp_path / "\u9ad8\u5ea6"
+    if name == "stdout":
+        assert call("export", campaign, "--format", "csv", "--out", folder) == 0
+    else:
+        assert call("resume", folder) == 2
+    assert b"??" in written.getvalue()
 
 
 def test_an_interrupted_command_says_how_to_resume_a_campaign(campaign, capsys, monkeypatch):

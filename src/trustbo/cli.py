@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from trustbo.campaign.result import Result
     from trustbo.workspace import Workspace
 
+# Repeated from the modules that define them, which are slow to import; a test compares them.
 POLICIES = ("explore", "greedy", "optimistic", "thompson", "ucb", "random")
 OBJECTIVES = ("lost_contact", "terminal", "mean")
 FORMATS = ("geotiff", "geojson", "csv", "nav2")

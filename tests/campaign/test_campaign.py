@@ -265,6 +265,15 @@ def test_mission_that_measured_nothing_or_left_the_map_is_excluded():
     assert campaign.posterior["constant_data"]["mission"].values.tolist() == [2]
 
 
+def test_a_mission_that_is_told_twice_is_refused(workspace):
+    campaign = begin(workspace, fit={"draws": 100})
+    mission = rates(workspace, DIAGONAL)
+    campaign.tell(mission)
+    with pytest.raises(tb.TrustboError, match="again=True"):
+        campaign.tell(mission)
+    assert len(campaign.missions) == 1
+
+
 def test_excluded_mission_is_forgotten_until_it_is_told_again(workspace):
     campaign = begin(workspace, seed=1, fit={"draws": 300})
     missions = [rates(workspace, DIAGONAL, seed=j, fail_at=2) for j in range(3)]

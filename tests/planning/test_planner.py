@@ -405,6 +405,11 @@ def test_costs_risks_and_starts_are_read_by_name(workspace):
     np.testing.assert_array_equal(of_moves.problem.bound_cost, by_place.problem.bound_cost)
 
 
+def test_effects_of_places_on_another_grid_are_refused(workspace):
+    with pytest.raises(TrustboError, match="place"):
+        Planner(workspace, *ENDS).plan(PARAMS._replace(place=np.zeros((3, 4))))
+
+
 def test_options_that_are_no_maps_are_refused(workspace):
     for bound_cost in ("a", {"up": 1.0}, xr.DataArray(np.zeros((5, 6)), dims=("y", "x"))):
         with pytest.raises(TrustboError, match="bound_cost"):

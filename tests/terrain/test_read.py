@@ -1,6 +1,6 @@
 """Reading of rasters: heights in metres, missing ones NaN, north up; what cannot serve is refused.
 
-`benchmarks/field/` has the faults of rasters from public bug reports, one script each.
+Many of the faulty rasters are those of public bug reports.
 """
 
 import os
@@ -47,10 +47,11 @@ def plane(hole=None, dtype="float32", shape=(8, 10)):
 def write(path, *bands, crs=UTM, transform=CORNER, mask=None, colours=None, **profile):
     unit = profile.pop("unit", None)
     scale, gcps = profile.pop("scale", None), profile.pop("gcps", None)
+    dtype = profile.pop("dtype", bands[0].dtype)
     height, width = bands[0].shape
     with rasterio.open(
         path, "w", driver="GTiff", height=height, width=width, count=len(bands),
-        dtype=bands[0].dtype, crs=crs, transform=transform, **profile,
+        dtype=dtype, crs=crs, transform=transform, **profile,
     ) as sink:  # fmt: skip
         for k, values in enumerate(bands, 1):
             sink.write(values, k)
@@ -533,6 +534,7 @@ def test_what_is_no_raster_of_heights_is_refused(tmp_path, tif):
     both.to_netcdf(tmp_path / "both.nc")
     for wrong in (
         tmp_path / "notes.txt", tmp_path / "absent.tif", damaged, tmp_path / "both.nc", plane(),
+        write(tmp_path / "complex.tif", plane().astype("complex64"), dtype="complex_int16"),
         array(plane().astype(complex)), array(plane())[:1], array(plane()).expand_dims(t=2, b=3),
         array(plane()).rename(y="north", x="east"), array(plane())[:0],
     ):  # fmt: skip
