@@ -160,20 +160,21 @@ class World:
         course: str,
         folder: FilePath | None = None,
         max_bounds: int | str = "shortest+4",
+        **options: Any,
     ) -> Scene:
         """Make the scene of a course for `run_grid`; `folder` caches the truth on disk.
 
-        Raises TrustboError for an unknown course or missing files.
+        The `options` are those of `workspace`. Raises TrustboError for an unknown course or missing
+        files.
         """
-        workspace = self.workspace()
+        workspace = self.workspace(**options)
         paths = {"max_bounds": max_bounds}
         labels = {"world": self.name, "kind": self.kind, "of": self.case, "course": course}
 
         simulator = self.simulator(workspace)
         truth = Truth.from_simulator(simulator, folder=folder)
         ends = self.ends(course)
-        options = {"planner": paths}
-        return Scene(workspace, simulator, *ends, truth, options, labels, paths)
+        return Scene(workspace, simulator, *ends, truth, {"planner": paths}, labels, paths)
 
     def _events(self, terrain: xr.Dataset) -> list[Event]:
         """Return the events with their centres in CRS metres."""
