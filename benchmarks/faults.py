@@ -52,11 +52,11 @@ class Fault(NamedTuple):
     after: str
 
 
-MEASURED = """\
-                    self.storage.add_mission(n_before + 1, entry)
+WRITTEN = """\
+            self.storage.write(state)
 """
-LEARNED = """\
-                    self._add(entry)
+CHANGED = """\
+            self.state = state
 """
 FAULTS = (
     Fault("the evidence has the wrong sign of the residuals' square", "inference/engine.py",
@@ -104,10 +104,9 @@ FAULTS = (
     Fault("the truth's best path ends on the last bound but one", "simulation/truth.py",
           "last = (passed * contact)[:, *goal, END]", "last = (passed * contact)[:, *goal, 0]"),
     Fault("a fit takes the seeds of the policy", "campaign/learning.py",
-          'seed = state.seed_of("fit")\n    state.asked = None',
-          'seed = state.seed_of("policy")\n    state.asked = None'),
+          "seed=state.seed_of_fit", 'seed=state.seed_of("policy")'),
     Fault("a mission is learned from before it is on disk", "campaign/campaign.py",
-          MEASURED + LEARNED, LEARNED + MEASURED),
+          WRITTEN + CHANGED, CHANGED + WRITTEN),
     Fault("the y axis of a map for ROS is flipped", "export/nav2.py",
           "values[::-1].tobytes()", "values.tobytes()"),
     Fault("effects of robots belong to the robots in reverse", "models/effects/robot.py",

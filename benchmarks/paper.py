@@ -30,7 +30,7 @@ from summary import bootstrap
 from world_set import COURSES, World, drawn, worlds
 
 import trustbo as tb
-from trustbo.campaign.learning import informed_planner
+from trustbo.campaign.choose import informed_planner
 from trustbo.planning import Planner
 
 OBJECTIVES = {"(6)": "terminal", "mean": "mean"}

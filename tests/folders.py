@@ -40,17 +40,22 @@ def same(one, other):
 
 def drive(campaign):
     """Run a campaign of four missions, of which one fails, one is given up, one is excluded."""
-    state, simulator = campaign.state, ModelSimulator(campaign.workspace, blind=True)
-    if not state.entries:
-        campaign.tell(simulator.run(campaign.ask().path, seed=state.seed_of("mission")))
-    if len(state.entries) == 1 and not state.failures:
+    simulator = ModelSimulator(campaign.workspace, blind=True)
+
+    def run():
+        seed = campaign.state.seed_of("mission")
+        campaign.tell(simulator.run(campaign.ask().path, seed=seed))
+
+    if not campaign.missions:
+        run()
+    if len(campaign.missions) == 1 and not campaign.state.failures:
         campaign.ask()
         campaign.fail("stuck", where=campaign.ask().path[1])
     for n in (1, 2, 3):
-        if len(state.entries) == n:
+        if len(campaign.missions) == n:
             simulator.fail_at = 1 if n == 2 else None
-            campaign.tell(simulator.run(campaign.ask().path, seed=state.seed_of("mission")))
-        if n == 2 and len(state.entries) == 3 and not state.indices("excluded"):
+            run()
+        if n == 2 and len(campaign.missions) == 3 and len(campaign.state.used) == 3:
             campaign.exclude(1, "the lidar was covered")
     return campaign
 

@@ -98,7 +98,7 @@ def facts_of(result: Result) -> dict[str, str]:
     """Return the facts, by name, that are needed to decide whether to drive the path."""
     plan = result.plan
     bounds = bounds_of(result)
-    rate = result.state.entries[-1].row["contact_rate"]
+    rate = result.state.entries[-1].measures["contact_rate"]
     last = f"{rate:.1%} of the time" if np.isfinite(rate) else "not measured"
     cells = " → ".join(_name(cell) for cell in plan.path)
     facts = {

@@ -44,9 +44,14 @@ def tell(campaign, path, rng, *, n_run=None, status="ok", unmeasured=()):
     campaign.tell(tb.Mission.from_arrays(path, unknown, rates, status=status))
 
 
+def states_of(campaign):
+    """Return the state of each mission, such as "learned"."""
+    return [campaign.state.status_of(j)[0] for j in range(len(campaign.missions))]
+
+
 def exclude_one(campaign, rng):
     """Exclude the first mission that the campaign learns from, if there is one."""
-    states = [entry.row["state"] for entry in campaign.state.entries]
+    states = states_of(campaign)
     if LEARNED in states:
         campaign.exclude(states.index(LEARNED) + 1, "a bad day")
 
@@ -78,8 +83,8 @@ def begin(events, seed, **options):
 
 def learned(campaign):
     """Return the missions that the campaign learns from."""
-    entries = campaign.state.entries
-    return [entry.mission for entry in entries if entry.row["state"] == LEARNED]
+    told = zip(campaign.missions, states_of(campaign), strict=True)
+    return [mission for mission, state in told if state == LEARNED]
 
 
 def loaded(campaign, folder):
@@ -142,7 +147,7 @@ def compared(campaign, folder):
 
 def scored(campaign, folder):
     scores = tb.inference.score(campaign.posteriors, campaign.missions)
-    states = [entry.row["state"] for entry in campaign.state.entries]
+    states = states_of(campaign)
     assert [states[j] for j in scores["mission"].values] == [LEARNED] * scores.sizes["mission"]
 
 
@@ -225,7 +230,7 @@ def accepts(history):
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of missions that teach nothing
         campaign = begin(*history)
-        states = [entry.row["state"] for entry in campaign.state.entries]
+        states = states_of(campaign)
         predicted = [
             state == LEARNED and before is not None
             for before, state in zip(campaign.posteriors, states[1:], strict=False)

@@ -11,7 +11,7 @@ from folders import ENDS, numbers, same
 from worlds import ModelSimulator, unequal_robots
 
 import trustbo as tb
-from trustbo.campaign.storage import MemoryStorage
+from trustbo.campaign.folder import MemoryStorage
 from trustbo.errors import TrustboError
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, RobotEffect, default_model
 from trustbo.workspace import Workspace

@@ -132,7 +132,7 @@ def operations(campaign, mission):
 def summary(campaign):
     state = campaign.state
     asked = None if state.asked is None else state.asked.path
-    counted = tuple(entry.row["state"] == "excluded" for entry in state.entries)
+    counted = tuple(entry.why_excluded is not None for entry in state.entries)
     return counted, len(state.failures), asked
 
 

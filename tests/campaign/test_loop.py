@@ -12,7 +12,7 @@ from scipy.special import expit
 from worlds import ModelSimulator, hillside, random_cells
 
 import trustbo as tb
-from trustbo.campaign.storage import MemoryStorage
+from trustbo.campaign.folder import MemoryStorage
 from trustbo.inference import params_of
 from trustbo.planning import Planner
 from trustbo.planning.draws import choose_draws

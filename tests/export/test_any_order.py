@@ -7,7 +7,6 @@ import numpy as np
 import xarray as xr
 
 import trustbo as tb
-from trustbo.campaign.state import Posterior
 
 
 def shuffled(tree, seed=0):
@@ -24,12 +23,10 @@ def shuffled(tree, seed=0):
 
 def test_exports_and_report_do_not_depend_on_the_order_of_a_posterior(result, tmp_path):
     last = result.state.entries[-1]
-    state = result.state.copy()
-    state.entries[-1] = replace(
-        last, posterior=Posterior(last.posterior.name, shuffled(last.posterior()))
-    )
+    posterior = replace(last.posterior, tree=shuffled(last.posterior()))
+    entries = (*result.state.entries[:-1], replace(last, posterior=posterior))
     turned = copy.copy(result)
-    turned.state = state
+    turned.state = replace(result.state, entries=entries)
     turned._computed = {}
 
     formats = ["geotiff", "geojson", "csv", "nav2"]

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import xarray as xr
 
-from trustbo.campaign.learning import is_excluded_by_user, why_never_learned
-from trustbo.campaign.state import EarlierMissions
+from trustbo.campaign.state import EarlierMissions, why_never_learned
 from trustbo.data import Mission
 from trustbo.display import joined
 from trustbo.errors import TrustboError, require_list
@@ -83,7 +82,7 @@ def earlier_missions(
 def _missions_of(result: "Result") -> EarlierMissions:
     """Return the missions of a result to learn from, starting with its own earlier ones."""
     state = result.state
-    own = [entry.mission for entry in state.entries if not is_excluded_by_user(entry)]
+    own = [entry.mission for entry in state.entries if entry.exclusion is None]
     return EarlierMissions((*state.earlier.missions, *own), tuple(state.lost))
 
 

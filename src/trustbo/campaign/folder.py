@@ -6,16 +6,17 @@
     missions/0001.nc      measurements and plan of the first mission, written before learning
     posteriors/0001.nc    draws of the parameters after the first mission; 0000.nc contains those
                           given the missions of earlier campaigns, if there are any
-    campaign.json         settings, the rows of completed missions, failures, and hashes of the
-                          other files; written last
+    campaign.json         settings, exclusions, failures, and hashes of the other files
 
-Every file is written under a temporary name, flushed to disk and renamed. A mission counts as
-recorded once its file has been renamed. Everything else counts as recorded once campaign.json has
-been replaced. If the process dies, no mission is lost: `Campaign.load` learns from the missions
-that are not in campaign.json yet.
+Files are only added; campaign.json, which lists them with their hashes, is replaced. Every file is
+written under a temporary name, flushed to disk and renamed, and campaign.json comes last: what it
+contains is recorded. A mission is recorded before the posterior is computed. If the process dies in
+between, `Campaign.load` computes it.
 """
 
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Callable, Container, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Self
@@ -27,23 +28,24 @@ from trustbo.campaign.lock import FolderLock
 from trustbo.campaign.record import (
     DIFFICULTY,
     EARLIER,
+    MISSIONS,
     RECORD,
     WORKSPACE,
     mission_file,
-    mission_files,
     posterior_file,
     record_to_bytes,
+    require_no_missions_above,
 )
 from trustbo.campaign.replace import (
-    commit_replacement,
-    finish_replacement,
+    discard,
     has_campaign,
     new_folder,
+    put_in_place,
     recorded_files,
     recover,
     remove_tree,
 )
-from trustbo.campaign.state import Entry, Posterior, State, StoredFile
+from trustbo.campaign.state import Entry, Posterior, State
 from trustbo.errors import TrustboError, warn
 from trustbo.files import (
     FilePath,
@@ -54,7 +56,7 @@ from trustbo.files import (
     to_path,
     write_file,
 )
-from trustbo.logs.netcdf import missions_to_tree, read_tree, tree_from_bytes, tree_to_bytes
+from trustbo.logs.netcdf import missions_to_tree, tree_to_bytes
 from trustbo.planning.plan import plan_to_record
 from trustbo.workspace import Workspace
 from trustbo.workspace.netcdf import difficulty_to_tree, workspace_to_tree
@@ -117,11 +119,7 @@ class FolderStorage:
             recover(lock.path)
             if not overwrite:
                 _require_no_campaign(path)
-            if (lock.path / RECORD).exists():
-                files = _replace_campaign(lock.path, workspace, state)
-            else:
-                files = _write_first(lock.path, workspace, state)
-            return cls(lock, files, workspace)
+            return cls(lock, _write_campaign(lock.path, workspace, state), workspace)
         except BaseException:
             # Another process may have made the folder, and written a campaign, in the meantime.
             if is_new and not has_campaign(path):
@@ -140,56 +138,59 @@ class FolderStorage:
                 "open, so nothing was recorded. Continue with Campaign.load."
             )
 
-    def add_mission(self, n: int, entry: Entry) -> None:
-        """Write the measurements, plan and table row of mission n."""
-        self.require_open()
-        name = mission_file(n)
-        if (self.path / name).exists():
-            raise TrustboError(
-                f"{str(self.path / name)!r} exists, but is not a mission of this campaign; move it "
-                "to another folder."
-            )
-        self._write(name, tree_to_bytes(_entry_to_tree(entry)))
-
     def write(self, state: State) -> None:
-        """Write the posteriors that have no files yet, and then campaign.json."""
-        self.require_open()
+        """Write the missions and posteriors that have no files yet, and then campaign.json.
 
-        for posterior in state.stored:
-            if posterior.tree is None:
-                continue
-            if posterior.file is None:
-                name = posterior_file(posterior.name)
-                posterior.file = self._write(name, tree_to_bytes(posterior.tree))
+        If this fails, campaign.json is as before, and the new files are removed.
+        """
+        self.require_open()
+        new: dict[str, str] = {}
+        try:
+            for name, content in _contents(self._workspace, state, known=self.files):
+                if name.startswith(MISSIONS):
+                    _set_aside(self.path / name)
+                new[name] = _write(self.path, name, content)
+            record = record_to_bytes(state, self.files | new)
+            write_file(self.path / RECORD, record, make_folder=False)
+        except BaseException:
+            if _version_of(self.path / RECORD) == self._written:
+                for name in new:
+                    with suppress(OSError):
+                        (self.path / name).unlink()
+            raise
+
+        self.files |= new
+        self._written = _version_of(self.path / RECORD)
+        self.adopt(state)
+
+    def adopt(self, state: State) -> None:
+        """Let the posteriors of a state that was written be read from this folder."""
+        for posterior in state.posteriors:
+            name = posterior_file(posterior.name)
+            posterior.file = self.path / name, self.files[name]
             if posterior is not state.last:
                 posterior.tree = None  # frees the memory
-
-        if DIFFICULTY not in self.files:
-            for name, content in _measured(self._workspace):
-                self._write(name, content)
-
-        record = record_to_bytes(state, self.files)
-        write_file(self.path / RECORD, record, make_folder=False)
-        self._written = _version_of(self.path / RECORD)
-
-    def stored(self, posterior: Posterior) -> StoredFile:
-        """Return the file of a posterior in this folder."""
-        name = posterior_file(posterior.name)
-        return StoredFile(self.path / name, self.files[name])
 
     def close(self) -> None:
         """Release the folder."""
         self._lock.release()
 
-    def _write(self, name: str, content: bytes) -> StoredFile:
-        """Write a file in the folder; if the folder was moved, it is not created again."""
-        stored = _write_stored(self.path, name, content)
-        self.files[name] = stored.sha256
-        return stored
+
+class MemoryStorage:
+    """Storage of a campaign that exists in memory only: its state is all there is to record."""
+
+    def require_open(self) -> None:
+        """Do nothing; it is always open."""
+
+    def write(self, state: State) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing; the campaign can go on."""
 
 
-def _write_stored(folder: Path, name: str, content: bytes) -> StoredFile:
-    """Write a file of a folder, given its path in the folder."""
+def _write(folder: Path, name: str, content: bytes) -> str:
+    """Write a file, given its path in a folder, which is not created; returns its hash."""
     file = folder / name
     try:
         file.parent.mkdir(exist_ok=True)
@@ -197,36 +198,49 @@ def _write_stored(folder: Path, name: str, content: bytes) -> StoredFile:
         raise TrustboError(f"cannot create {str(file.parent)!r}: {error.strerror}.") from error
 
     write_file(file, content, make_folder=False)
-    return StoredFile(file, hash_of(content))
+    return hash_of(content)
+
+
+def _set_aside(file: Path) -> None:
+    """Rename a file with the name of a new mission, which campaign.json does not list.
+
+    A process died before it recorded this mission, or an older campaign.json was restored.
+    """
+    if file.exists():
+        try:
+            os.replace(file, file.with_suffix(".unrecorded"))
+        except OSError as error:
+            raise TrustboError(f"cannot rename {str(file)!r}: {error.strerror}.") from error
+
+
+def _contents(
+    workspace: Workspace, state: State, known: Container[str] = ()
+) -> Iterator[tuple[str, bytes]]:
+    """Make the files of a campaign, except campaign.json and known ones: path and content."""
+    makers: dict[str, Callable[[], xr.DataTree]] = {WORKSPACE: lambda: workspace_to_tree(workspace)}
+    if workspace.posts is not None and workspace.difficulty.is_whole:
+        makers[DIFFICULTY] = lambda: difficulty_to_tree(workspace.difficulty)
+    if state.earlier.missions:
+        makers[EARLIER] = lambda: earlier_to_tree(state.earlier)
+    for n, entry in enumerate(state.entries, start=1):
+        makers[mission_file(n)] = lambda entry=entry: _entry_to_tree(entry)
+
+    for name, make in makers.items():
+        if name not in known:
+            yield name, tree_to_bytes(make())
+    for posterior in state.posteriors:
+        name = posterior_file(posterior.name)
+        if name not in known:
+            yield name, _content_of(posterior)
 
 
 def _entry_to_tree(entry: Entry) -> xr.DataTree:
-    """Convert a mission with its plan and its table row to a data tree."""
+    """Convert a mission with its plan to a data tree."""
     planned = xr.Dataset({"trust_map": entry.trust_map})
-    planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "row": to_json(entry.row)}
+    planned.attrs = {"plan": to_json(plan_to_record(entry.plan))}
     tree = missions_to_tree([entry.measured])
     tree["planned"] = xr.DataTree(planned)
     return tree
-
-
-def _contents(workspace: Workspace, state: State) -> Iterator[tuple[str, bytes]]:
-    """Make the files of a campaign, except campaign.json: path in the folder, and content."""
-    yield WORKSPACE, tree_to_bytes(workspace_to_tree(workspace))
-    yield from _measured(workspace)
-    if state.earlier.missions:
-        yield EARLIER, tree_to_bytes(earlier_to_tree(state.earlier))
-
-    for n, entry in enumerate(state.entries, start=1):
-        yield mission_file(n), tree_to_bytes(_entry_to_tree(entry))
-    posteriors = {posterior.name: posterior for posterior in state.stored}
-    for name, posterior in posteriors.items():
-        yield posterior_file(name), _content_of(posterior)
-
-
-def _measured(workspace: Workspace) -> Iterator[tuple[str, bytes]]:
-    """Make the file of the difficulty of bounds, if all of them have been measured."""
-    if workspace.posts is not None and workspace.difficulty.is_whole:
-        yield DIFFICULTY, tree_to_bytes(difficulty_to_tree(workspace.difficulty))
 
 
 def _content_of(posterior: Posterior) -> bytes:
@@ -243,95 +257,52 @@ def _content_of(posterior: Posterior) -> bytes:
 def without_lost_posteriors(state: State) -> State:
     """Return a state without the posteriors whose files cannot be read any more, with a warning.
 
-    If the last one is missing, a fit is due, so that the next plan does not come from the prior.
+    If the last one is missing, it is computed again, so that no plan comes from the prior.
     """
-    initial = state.initial
-    lost = []
-    if initial is not None and _is_lost(initial):
-        initial = None
-        lost.append(0)
-
-    entries = []
-    for n, entry in enumerate(state.entries, start=1):
-        if entry.posterior is not None and _is_lost(entry.posterior):
-            entry = replace(entry, posterior=None)
-            lost.append(n)
-        entries.append(entry)
-
+    lost = [posterior for posterior in state.posteriors if posterior.is_lost]
     if not lost:
         return state
+
     warn(
-        f"the posteriors after the missions {lost} cannot be read and are not saved. The missions "
-        "are complete, and Campaign.load computes the last posterior again."
+        f"the posteriors {', '.join(one.name for one in lost)} cannot be read and are not saved. "
+        "The missions are complete, and Campaign.load computes the last posterior again."
     )
-    remaining = replace(state, entries=entries, initial=initial)
-    if entries and remaining.last is None and state.due is None:
-        remaining.due = state.seed_of("fit")
-    return remaining
+    entries = tuple(
+        replace(entry, posterior=None) if entry.posterior in lost else entry
+        for entry in state.entries
+    )
+    initial = None if state.initial in lost else state.initial
+    fitted = None if state.last in lost else state.fitted
+    return replace(state, entries=entries, initial=initial, fitted=fitted)
 
 
-def _is_lost(posterior: Posterior) -> bool:
-    """Return whether a posterior cannot be read any more."""
-    if posterior.tree is not None or posterior.file is None:
-        return False
-    try:
-        read_file(*posterior.file)
-    except TrustboError:
-        return True
-    return False
+def _write_campaign(folder: Path, workspace: Workspace, state: State) -> dict[str, str]:
+    """Write a campaign beside the one in the folder, if any, and put it in place.
 
-
-def _write_first(folder: Path, workspace: Workspace, state: State) -> dict[str, str]:
-    """Write a campaign to a folder that contains none, and return the hashes of its files.
-
-    If this fails, the files are removed again. Files with these names that exist already are
-    replaced only if they have the same content, as when an earlier process died here.
+    Returns the hashes of its files. If this fails, a folder without campaign is as before.
     """
-    _require_no_missions_of_others(folder, len(state.entries), [])
-    files: dict[str, str] = {}
-    written: list[Path] = []
-    try:
-        for name, content in _contents(workspace, state):
-            file = folder / name
-            if file.exists() and not _has_content(file, content):
-                raise TrustboError(
-                    f"{str(file)!r} exists, but no campaign in this folder lists it; move it, or "
-                    "give another folder."
-                )
-            files[name] = _write_stored(folder, name, content).sha256
-            written.append(file)
-        write_file(folder / RECORD, record_to_bytes(state, files), make_folder=False)
-    except BaseException:
-        for file in (folder / RECORD, *written):
-            file.unlink(missing_ok=True)
-        raise
-    return files
-
-
-def _replace_campaign(folder: Path, workspace: Workspace, state: State) -> dict[str, str]:
-    """Write a campaign beside the one in the folder, and then replace the old one."""
     old = recorded_files(folder)
-    _require_no_missions_of_others(folder, len(state.entries), old)
+    require_no_missions_above(folder, len(state.entries), old)
+    files: dict[str, str] = {}
     beside = new_folder(folder)
     try:
-        files = {
-            name: _write_stored(beside, name, content).sha256
-            for name, content in _contents(workspace, state)
-        }
-
-        for name in files:
+        for name, content in _contents(workspace, state):
             if name not in old and (folder / name).exists():
                 raise TrustboError(
-                    f"{str(folder / name)!r} exists, but is not a file of the campaign in this "
-                    "folder; move it, or give another folder."
+                    f"{str(folder / name)!r} exists, but no campaign in this folder lists it; "
+                    "move it, or give another folder."
                 )
+            files[name] = _write(beside, name, content)
         write_file(beside / RECORD, record_to_bytes(state, files), make_folder=False)
 
         with holding_interrupts():
-            commit_replacement(folder, beside, old, list(files))
-            finish_replacement(folder)
+            put_in_place(folder, beside)
     except BaseException:
         remove_tree(beside)
+        if not old:
+            discard(folder)
+            for name in (RECORD, *files):
+                (folder / name).unlink(missing_ok=True)
         raise
     return files
 
@@ -350,30 +321,6 @@ def _require_no_campaign(path: Path) -> None:
             f"{str(path)!r} contains a campaign: continue it (Campaign.load, resume), give another "
             "folder, or replace it (overwrite)."
         )
-
-
-def _require_no_missions_of_others(folder: Path, n_missions: int, old: Sequence[str]) -> None:
-    """Raise TrustboError for missions that the new campaign in a folder would take for its own.
-
-    Args:
-        folder: Folder of the campaign.
-        n_missions: Number of missions of the new campaign.
-        old: Files of the campaign that is replaced.
-    """
-    for file in mission_files(folder):
-        if int(file.stem) > n_missions and file.relative_to(folder).as_posix() not in old:
-            raise TrustboError(
-                f"{str(file)!r} exists, but no campaign in this folder lists it; move it, or give "
-                "another folder."
-            )
-
-
-def _has_content(file: Path, content: bytes) -> bool:
-    """Compare a netCDF file by its values, because the bytes contain the time of writing."""
-    try:
-        return read_tree(file).identical(tree_from_bytes(content))
-    except TrustboError:
-        return False
 
 
 def _version_of(file: Path) -> tuple[int, int, int] | None:

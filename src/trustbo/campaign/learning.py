@@ -1,4 +1,4 @@
-"""Learning from missions: the posterior, the hazard, and the planner of the next path."""
+"""Learning from missions: the posterior of trust and the hazard."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,27 +6,16 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from trustbo.campaign.state import EXCLUDED, LEARNED, TOLD, Entry, State
+from trustbo.campaign.state import Posterior, State, why_never_learned
 from trustbo.data import Mission
 from trustbo.errors import PosteriorError, TrustboError, warn
 from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard
-from trustbo.hazard.risk import BoundRisk
+from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.learner import Learner
-from trustbo.models.draws import Draws
-from trustbo.planning import Plan, Planner
+from trustbo.planning import Plan
 from trustbo.stacking import pooled
 from trustbo.workspace import Workspace
-
-_STOPPED = 2
-"""Number of failures after which a bound is avoided."""
-_RECOVERED = 0.2
-"""Failure probability below which such a bound is allowed again."""
-_ROUNDING = 1e-9
-"""Largest rounding error of an expected number of failures."""
-_HOPELESS = 0.9
-"""Failure probability of the best path above which the safest path is planned instead."""
-
 
 AWARENESS = ("map", "measured")
 """Sources of awareness from which a campaign learns."""
@@ -59,69 +48,96 @@ def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Missio
     return mission.with_awareness(np.where(np.isnan(first), second, first))
 
 
-def why_never_learned(mission: Mission) -> str:
-    """Return why a mission can never be used for learning, or an empty string."""
-    if not np.isfinite(mission.contact_rate).any():
-        return "no contact rate was measured."
-    if np.isnan(mission.awareness).any():
-        k = int(np.argwhere(np.isnan(mission.awareness))[0, 0])
-        return f"the map has no awareness in cell {mission.bounds[k].cell} of bound {k + 1}."
-    return ""
+def require_new(state: State, mission: Mission) -> None:
+    """Raise TrustboError if a mission with the same data is recorded and not excluded."""
+    has_failed = any(status != "ok" for status in mission.statuses)
+    if not has_failed and not np.isfinite(mission.contact_rate).any():
+        return  # without rates and failures, missions on the same path are alike
+
+    for n, entry in enumerate(state.entries, start=1):
+        if entry.measured.has_same_data(mission) and entry.exclusion is None:
+            raise TrustboError(
+                f"mission {n} has the same data, so this mission is recorded already. If it is "
+                "another mission, call tell(mission, again=True)."
+            )
 
 
-def add_entry(state: State, entry: Entry) -> None:
-    """Add a mission that is on disk to a state, and mark the fit as due."""
-    entry.posterior = state.last
-    seed = state.seed_of("fit")
-    state.asked = None
-    state.entries.append(entry)
-
-    reason = why_never_learned(entry.mission)
-    if reason:
-        entry.become(EXCLUDED, reason)
-    else:
-        state.due = seed
-
-
-def is_excluded_by_user(entry: Entry) -> bool:
-    """Return whether a mission was excluded for another reason than `why_never_learned`."""
-    own = why_never_learned(entry.mission) or None
-    return entry.row["state"] == EXCLUDED and entry.row["reason"] != own
+def require_ends(plan: Plan, mission: Mission) -> None:
+    """Raise TrustboError unless a mission has the plan's start and, if it is "ok", its goal."""
+    start = plan.path[0]
+    goal = plan.path[-1]
+    if mission.path[0] != start:
+        raise TrustboError(
+            f"the mission starts in cell {mission.path[0]}; it must start in {start}."
+        )
+    if mission.status == "ok" and mission.path[-1] != goal:
+        raise TrustboError(
+            f'the status "ok" means that the goal {goal} was reached, but the mission ends in cell '
+            f"{mission.path[-1]}; give the planned cells up to the goal, and a status such as "
+            '"aborted".'
+        )
 
 
-def learn(
-    state: State, learner: Learner, workspace: Workspace, seed: int, progress: bool
-) -> tuple[xr.DataTree | None, str]:
+def with_posterior(
+    state: State, learner: Learner, workspace: Workspace, hazard: xr.Dataset, progress: bool
+) -> State:
+    """Return a state whose posterior is that of the missions that are used.
+
+    If no mission is used, it is that of the earlier missions, if there are any. If the fit fails,
+    the last posterior remains, and the new state contains the reason.
+
+    Args:
+        state: State of the campaign.
+        learner: The model, as campaigns use it.
+        workspace: Workspace of the campaign.
+        hazard: Group `hazard` of the posterior.
+        progress: Whether to show a progress bar.
+    """
+    used = state.used
+    posterior = None if used else state.initial
+    if posterior is None and (used or state.earlier.missions):
+        try:
+            posterior = _fitted(state, learner, workspace, hazard, progress)
+        except TrustboError as error:
+            return replace(state, fitted=used, why_not=getattr(error, "reason", str(error)))
+        except Exception as error:  # a bug must not lose a recorded mission
+            if isinstance(error.__cause__, KeyboardInterrupt):  # numba wraps it
+                raise error.__cause__ from None
+            return replace(state, fitted=used, why_not=f"{type(error).__name__}: {error}")
+
+    entries = state.entries
+    if entries:
+        entries = (*entries[:-1], replace(entries[-1], posterior=posterior))
+    initial = state.initial if used else posterior
+    return replace(state, entries=entries, initial=initial, fitted=used, why_not="")
+
+
+def _fitted(
+    state: State, learner: Learner, workspace: Workspace, hazard: xr.Dataset, progress: bool
+) -> Posterior:
     """Fit the posterior of the parameters to all missions that are not excluded.
 
     Missions of earlier campaigns come first. The attribute `missions` of the posterior lists the
-    indices of the missions, which are negative for earlier campaigns. The state does not change.
-
-    Returns:
-        The posterior and an empty text; or, if the fit fails, None and the reason.
+    indices of the missions, which are negative for earlier campaigns.
     """
-    used = state.indices(TOLD, LEARNED)
-    missions = [state.entries[j].mission for j in used]
-    try:
-        tree = learner.fit(
-            missions,
-            workspace=workspace,
-            sampler=state.settings["sampler"],
-            seed=seed,
-            progress=progress,
-            start=_previous(state),
-            earlier=usable(state.earlier.missions),
-            **state.settings["fit"],
-        )
-    except TrustboError as error:
-        return None, getattr(error, "reason", str(error))
-    except Exception as error:  # a bug must not lose a recorded mission
-        if isinstance(error.__cause__, KeyboardInterrupt):  # numba wraps it
-            raise error.__cause__ from None
-        return None, f"{type(error).__name__}: {error}"
+    used = state.used
+    earlier = usable(state.earlier.missions)
+    tree = learner.fit(
+        [state.entries[j].mission for j in used],
+        workspace=workspace,
+        sampler=state.settings["sampler"],
+        seed=state.seed_of_fit,
+        progress=progress,
+        start=_previous(state),
+        earlier=earlier,
+        **state.settings["fit"],
+    )
+    tree.attrs["missions"] = [*range(-len(earlier), 0), *used]
+    tree["hazard"] = xr.DataTree(hazard)
 
-    tree.attrs["missions"] = labels_of(state, used)
-    return tree, ""
+    n_excluded = len(state.entries) - len(used)
+    name = f"{len(state.entries):04d}-{n_excluded}" if n_excluded else f"{len(state.entries):04d}"
+    return Posterior(name if used else "0000", used, diagnostics(tree), tree)
 
 
 def usable(missions: Sequence[Mission]) -> list[Mission]:
@@ -129,13 +145,8 @@ def usable(missions: Sequence[Mission]) -> list[Mission]:
     return [mission for mission in missions if not why_never_learned(mission)]
 
 
-def labels_of(state: State, used: Sequence[int]) -> list[int]:
-    """Return the indices of all missions in a fit: earlier ones are -n, ..., -1."""
-    return [*range(-len(usable(state.earlier.missions)), 0), *used]
-
-
 def fitted_missions(state: State, labels: Sequence[int]) -> list[Mission]:
-    """Return the missions in a fit by their indices; see `labels_of`."""
+    """Return the missions in a fit by their indices; earlier ones are -n, ..., -1."""
     earlier = usable(state.earlier.missions)
     own = [state.entries[j].mission for j in labels if j >= 0]
     n_earlier = sum(j < 0 for j in labels)
@@ -186,7 +197,7 @@ def missions_of_hazard(
         (None, mission) for mission in state.earlier.missions if not mission.map
     ]
     for number, entry in enumerate(state.entries, start=1):
-        if not is_excluded_by_user(entry):
+        if entry.exclusion is None:
             measured.append((number, _with_planned_path(entry.measured, entry.plan)))
     if so_far is not None:
         plan = state.asked
@@ -204,58 +215,3 @@ def _with_planned_path(mission: Mission, plan: Plan) -> Mission:
     if mission.status == "ok" or len(plan.path) <= n or plan.path[:n] != mission.path:
         return mission
     return replace(mission, path=plan.path)
-
-
-def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
-    """Make a planner that accounts for the failure probabilities of bounds.
-
-    A bound that failed twice is avoided unless there is no other path, or its failure probability
-    has fallen below 0.2. If failures have a cost, a bound is avoided only if this applies with all
-    of its next moves, because the search accounts for the others by their cost.
-
-    Before the first failure, the user's slope limit is trusted, and failures have no cost unless
-    the user gave `failure_cost`. Under the prior alone, a cost would rule out longer paths that
-    keep contact and never fail. The cost is computed jointly over components of the hazard
-    posterior, because all bounds share the slope limit.
-    """
-    if planner.problem.failure_cost is None and not risk.has_failures:
-        planner = planner.with_failure_cost(0.0)
-
-    planner = planner.with_risk(risk)
-    problem = planner.problem
-    priced = problem.objective.of_contact and problem.failure_cost != 0.0
-    n_stopped = risk.past_failures if priced else risk.past_failures_of_bounds[..., None]
-    stopped = n_stopped + _ROUNDING >= _STOPPED
-    if not stopped.any():
-        return planner
-
-    is_likely = ~(risk.mean < _RECOVERED)
-    if priced:
-        stopped &= is_likely
-        avoided = stopped.any(-1) & (stopped | ~risk.exists).all(-1)
-    else:
-        avoided = stopped.any(-1) & (is_likely & risk.exists).any(-1)
-    if not avoided.any():
-        return planner
-    return planner.avoiding(avoided, np.nanmax(risk.mean, axis=-1, initial=0.0))
-
-
-def instead_of_failure(planner: Planner, plan: Plan, draws: Draws) -> Plan:
-    """Return the plan, or the safest one if the plan almost certainly fails.
-
-    If all paths are likely to fail, their costs of failure are nearly equal, so that the plan would
-    minimise lost contact again. This function has an effect only if failures have a cost.
-
-    Args:
-        planner: Planner of `informed_planner`.
-        plan: Plan of a policy.
-        draws: Parameter draws, under whose mean the safest path is evaluated.
-    """
-    problem = planner.problem
-    if problem.risk is None or not problem.cost_of_failure:
-        return plan
-    if problem.risk.failure(plan.path) <= _HOPELESS:
-        return plan
-
-    path, _ = problem.safest()
-    return planner.evaluate(path, draws.mean())

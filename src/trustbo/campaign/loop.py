@@ -115,7 +115,7 @@ def resume(
         total = before.get("n_iterations", 8) if n_iterations is None else n_iterations
         steps = campaign.run(simulator, total, stop=stop, progress=progress)
 
-        for name, value in state.simulation.items():
+        for name, value in campaign.state.simulation.items():
             if name != "n_iterations" and repr(before.get(name, value)) != repr(value):
                 raise TrustboError(
                     f"simulator: the campaign was run with {name} = {before[name]!r}, not "

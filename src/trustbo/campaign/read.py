@@ -1,7 +1,9 @@
 """Reading of the folder of a campaign."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from trustbo.campaign.earlier import earlier_from_tree
 from trustbo.campaign.learning import as_learned
@@ -12,15 +14,18 @@ from trustbo.campaign.record import (
     RECORD,
     WORKSPACE,
     mission_file,
-    mission_files,
-    posterior_file,
-    record_from_bytes,
+    read_record,
+    require_no_missions_above,
     state_from_record,
 )
 from trustbo.campaign.replace import has_campaign, is_being_replaced, recover
-from trustbo.campaign.state import Entry, Posterior, State, StoredFile
+from trustbo.campaign.result import Result
+from trustbo.campaign.settings import to_planner
+from trustbo.campaign.state import Entry, State
 from trustbo.errors import TrustboError, warn
-from trustbo.files import FilePath, interpreting, read_file, to_path
+from trustbo.files import FilePath, to_path
+from trustbo.inference.functions.function import is_of_function
+from trustbo.inference.learner import ClassLearner, Learner, Model, learner_from_record
 from trustbo.logs.netcdf import missions_from_tree, read_tree
 from trustbo.planning.plan import plan_from_record
 from trustbo.workspace import Workspace
@@ -35,8 +40,7 @@ def lock_campaign(directory: FilePath) -> FolderLock:
     Raises:
         TrustboError: The folder contains no campaign, or another process uses it.
     """
-    path = require_campaign(directory)
-    lock = FolderLock(path, take_over=True)
+    lock = FolderLock(require_campaign(directory), take_over=True)
     try:
         recover(lock.path)
     except BaseException:
@@ -45,14 +49,11 @@ def lock_campaign(directory: FilePath) -> FolderLock:
     return lock
 
 
-def read_campaign(
-    directory: FilePath,
-) -> tuple[State, Workspace, list[Entry], dict[str, str]]:
+def read_campaign(directory: FilePath) -> tuple[State, Workspace, dict[str, str]]:
     """Read a campaign.
 
     Returns:
-        The state, the workspace, the missions that are not in campaign.json yet, and the hashes of
-        the files that campaign.json lists.
+        The state, the workspace, and the hashes of the files that campaign.json lists.
 
     Raises:
         TrustboError: The folder contains no campaign, another version of trustbo wrote it, or a
@@ -63,85 +64,51 @@ def read_campaign(
         with FolderLock(folder) as lock:  # refused while somebody replaces it
             recover(lock.path)
 
-    path = folder / RECORD
-    record = record_from_bytes(read_file(path), path)
-    with interpreting(path):
-        files = {str(name): str(sha256) for name, sha256 in record["files"].items()}
-        rows = [dict(row) for row in record["rows"]]
-        names = [None if name is None else str(name) for name in record["posteriors"]]
-        initial = record["initial"]
-        stored = {}
-        for name in [initial, *names]:
-            if name is not None:
-                file = posterior_file(name)
-                stored[name] = Posterior(name, file=StoredFile(folder / file, files[file]))
+    record = read_record(folder / RECORD)
+    files: dict[str, str] = record["files"]
+    n_missions = len(record["exclusions"])
+    # The next number is left by a process that died before it recorded its mission.
+    require_no_missions_above(folder, n_missions + 1, files)
 
-    tree = read_tree(folder / WORKSPACE, files.get(WORKSPACE, ""))
-    with interpreting(folder / WORKSPACE):
-        workspace = workspace_from_tree(tree)
+    workspace = workspace_from_tree(read_tree(folder / WORKSPACE, files[WORKSPACE]))
     if DIFFICULTY in files and not _restore_difficulty(folder, workspace, files[DIFFICULTY]):
         del files[DIFFICULTY]
 
-    with interpreting(path):
-        state = state_from_record(record, workspace)
-    state.initial = None if initial is None else stored[initial]
+    awareness = record["settings"]["awareness"]
+    entries = []
+    for n in range(1, n_missions + 1):
+        tree = read_tree(folder / mission_file(n), files[mission_file(n)])
+        [measured] = missions_from_tree(tree)
+        planned = tree["planned"].to_dataset()
+        plan = plan_from_record(json.loads(planned.attrs["plan"]), workspace)
+        learned = as_learned(measured, workspace, awareness)
+        entries.append(Entry(plan, measured, learned, planned["trust_map"]))
 
+    state = state_from_record(record, entries, folder, workspace)
     if EARLIER in files:
-        tree = read_tree(folder / EARLIER, files[EARLIER])
-        with interpreting(folder / EARLIER):
-            state.earlier = earlier_from_tree(tree)
+        earlier = earlier_from_tree(read_tree(folder / EARLIER, files[EARLIER]))
+        state = replace(state, earlier=earlier)
+    return state, workspace, files
 
-    awareness = state.settings["awareness"]
-    entries = _read_entries(folder, workspace, awareness, files, len(rows))
-    for entry, row, name in zip(entries, rows, names, strict=False):
-        entry.row = row
-        entry.posterior = None if name is None else stored[name]
 
-    state.entries = entries[: len(rows)]
-    return state, workspace, entries[len(rows) :], files
+def warn_of_unrecorded(folder: Path, n_missions: int) -> None:
+    """Warn if there is a mission that a process wrote, but died before it recorded it."""
+    file = folder / mission_file(n_missions + 1)
+    if file.exists():
+        warn(
+            f"mission {n_missions + 1} was written to {str(file)!r}, but not recorded, as the "
+            "process died. Unless you tell it anyway, read it with logs.read_missions and tell it."
+        )
 
 
 def _restore_difficulty(folder: Path, workspace: Workspace, sha256: str) -> bool:
     """Read the difficulty of bounds; warn and return False if the file cannot be read."""
     try:
-        tree = read_tree(folder / DIFFICULTY, sha256)
-        with interpreting(folder / DIFFICULTY):
-            restore_difficulty(workspace, tree)
+        restore_difficulty(workspace, read_tree(folder / DIFFICULTY, sha256))
     except TrustboError as error:  # it can be measured again
         warn(f"{error} The difficulty of bounds will be measured again.")
         return False
     return True
-
-
-def _read_entries(
-    folder: Path, workspace: Workspace, awareness: str, files: dict[str, str], n_rows: int
-) -> list[Entry]:
-    """Read the missions of a folder, of which campaign.json lists `n_rows`.
-
-    Raises TrustboError if one is missing.
-    """
-    there = mission_files(folder)
-    n_last = int(there[-1].stem) if there else 0
-    entries = []
-    for n in range(1, max(n_rows, n_last) + 1):
-        name = mission_file(n)
-        file = folder / name
-        if not file.exists() and n > n_rows:
-            raise TrustboError(
-                f"{str(file)!r} is missing, although {there[-1].name} exists. Restore it, or move "
-                "the later missions to another folder."
-            )
-
-        tree = read_tree(file, files.get(name, ""))
-        with interpreting(file):
-            [measured] = missions_from_tree(tree)
-            planned = tree["planned"].to_dataset()
-            plan = plan_from_record(json.loads(planned.attrs["plan"]), workspace)
-            row = json.loads(planned.attrs["row"])
-            learned = as_learned(measured, workspace, awareness)
-
-        entries.append(Entry(plan, measured, learned, planned["trust_map"], row))
-    return entries
 
 
 def require_campaign(directory: FilePath) -> Path:
@@ -154,3 +121,46 @@ def require_campaign(directory: FilePath) -> Path:
     if not found:
         raise TrustboError(f"{str(directory)!r} contains no campaign; give another folder.")
     return path
+
+
+def load_result(
+    directory: FilePath, *, model: Model | None = None, progress: bool = True
+) -> Result:
+    """Read the result of a campaign from its folder, without locking the folder.
+
+    The campaign may still be running in another process.
+
+    Args:
+        directory: Folder of a campaign, or a folder written by `Result.save`.
+        model: Model of the campaign; needed if it is a NumPyro function, or if it is custom and
+            nothing has been learned.
+        progress: Whether to show a progress bar if `posterior` takes longer than 1.5 seconds.
+
+    Raises:
+        TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is
+            missing or damaged.
+
+    Example:
+        >>> result = tb.load_result("hills")
+        >>> result.table
+    """
+    state, workspace, _ = read_campaign(directory)
+    if not state.entries:
+        raise TrustboError(f"the campaign in {str(directory)!r} has no mission; run one first.")
+
+    learner = _learner_of(state, model)
+    result = Result(workspace, state, learner, to_planner(state.settings, workspace))
+    result._progress = progress
+    return result
+
+
+def _learner_of(state: State, model: Model | None) -> Learner:
+    """Return the learner of a stored campaign, whose model may be given."""
+    record: dict[str, Any] = state.settings["model_record"]
+    try:
+        return learner_from_record(record, model)
+    except TrustboError:
+        # A model class with custom priors is needed only if nothing has been learned.
+        if state.last is None or model is not None or is_of_function(record):
+            raise
+        return ClassLearner(None)

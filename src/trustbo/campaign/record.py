@@ -1,15 +1,16 @@
-"""The file campaign.json: settings, rows of completed missions, failures, and hashes of files."""
+"""The file campaign.json: settings, exclusions, posteriors, failures, and hashes of all files."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from trustbo.campaign.state import Failure, State
+from trustbo.campaign.state import Entry, Exclusion, Failure, Posterior, State
 from trustbo.errors import TrustboError
-from trustbo.files import FilePath, hash_of, interpreting, to_json
+from trustbo.files import hash_of, interpreting, read_file, to_json
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace import Workspace
@@ -31,13 +32,22 @@ def mission_file(n: int) -> str:
     return f"{MISSIONS}/{n:04d}.nc"
 
 
-def mission_files(folder: Path) -> list[Path]:
-    """Return the files in a folder that are named like the missions of a campaign, in order."""
-    numbered = {}
-    for file in (folder / MISSIONS).glob("*.nc"):
-        if file.stem.isdecimal() and file == folder / mission_file(int(file.stem)):
-            numbered[int(file.stem)] = file
-    return [numbered[n] for n in sorted(numbered)]
+def require_no_missions_above(folder: Path, n_last: int, known: Mapping[str, str]) -> None:
+    """Raise TrustboError for unknown files of missions above `n_last`, which would be taken over.
+
+    Args:
+        folder: Folder of a campaign.
+        n_last: Number of the last mission that may have a file.
+        known: Files of the campaign.
+    """
+    for file in sorted((folder / MISSIONS).glob("*.nc")):
+        is_numbered = file.stem.isdecimal() and file == folder / mission_file(int(file.stem))
+        if not is_numbered or int(file.stem) <= n_last or mission_file(int(file.stem)) in known:
+            continue
+        raise TrustboError(
+            f"{str(file)!r} exists, but {RECORD} in this folder does not list it. Move it; or "
+            f"restore the latest {RECORD}, if this one is an older copy; or give another folder."
+        )
 
 
 def posterior_file(name: str) -> str:
@@ -57,10 +67,12 @@ def record_to_bytes(state: State, files: Mapping[str, str]) -> bytes:
         "settings": state.settings,
         "simulation": state.simulation,
         "asked": None if state.asked is None else plan_to_record(state.asked),
-        "rows": [entry.row for entry in state.entries],
-        "posteriors": [entry.posterior and entry.posterior.name for entry in state.entries],
+        "exclusions": [entry.exclusion for entry in state.entries],
+        "after_missions": [entry.posterior and entry.posterior.name for entry in state.entries],
         "initial": state.initial and state.initial.name,
-        "due": state.due,
+        "posteriors": {one.name: [one.used, one.diagnostics] for one in state.posteriors},
+        "fitted": state.fitted,
+        "why_not": state.why_not,
         "failures": state.failures,
         "stop_reason": state.stop_reason,
         "files": files,
@@ -70,12 +82,13 @@ def record_to_bytes(state: State, files: Mapping[str, str]) -> bytes:
     return to_json(plain | {"checksum": _checksum(plain)}).encode()
 
 
-def record_from_bytes(content: bytes, path: FilePath) -> dict[str, Any]:
-    """Read the content of campaign.json; `path` is named in messages.
+def read_record(path: Path) -> dict[str, Any]:
+    """Read campaign.json.
 
     Raises:
-        TrustboError: Another version of trustbo wrote it, or it is damaged.
+        TrustboError: Another version of trustbo wrote it, or it is missing or damaged.
     """
+    content = read_file(path)
     with interpreting(path):
         record = dict(json.loads(content))
         versions = record.get("versions")
@@ -93,21 +106,46 @@ def record_from_bytes(content: bytes, path: FilePath) -> dict[str, Any]:
     return record
 
 
-def state_from_record(record: dict[str, Any], workspace: Workspace) -> State:
-    """Restore the state of a campaign, without its missions."""
+def state_from_record(
+    record: dict[str, Any], entries: Sequence[Entry], folder: Path, workspace: Workspace
+) -> State:
+    """Restore the state of a campaign, without earlier missions.
+
+    Args:
+        record: Content of campaign.json.
+        entries: Missions without their exclusions and posteriors.
+        folder: Folder of the campaign.
+        workspace: Workspace of the campaign.
+    """
+    posteriors: dict[str | None, Posterior | None] = {None: None}
+    for name, (used, diagnostics) in record["posteriors"].items():
+        file = posterior_file(name)
+        stored = folder / file, record["files"][file]
+        posteriors[name] = Posterior(name, tuple(used), diagnostics, file=stored)
+
+    complete = []
+    of_entries = zip(entries, record["exclusions"], record["after_missions"], strict=True)
+    for entry, excluded, name in of_entries:
+        exclusion = None if excluded is None else Exclusion(*excluded)
+        complete.append(replace(entry, exclusion=exclusion, posterior=posteriors[name]))
+
     failures = []
     for after, reason, path, where in record["failures"]:
         cells = tuple((row, col) for row, col in path)
         failures.append(Failure(after, reason, cells, None if where is None else tuple(where)))
 
     asked = record["asked"]
+    fitted = record["fitted"]
     return State(
         settings=record["settings"],
-        failures=failures,
+        entries=tuple(complete),
+        failures=tuple(failures),
         asked=None if asked is None else plan_from_record(asked, workspace),
         simulation=record["simulation"],
-        stop_reason=str(record["stop_reason"]),
-        due=record["due"],
+        stop_reason=record["stop_reason"],
+        fitted=None if fitted is None else tuple(fitted),
+        why_not=record["why_not"],
+        initial=posteriors[record["initial"]],
     )
 
 

@@ -8,15 +8,19 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from trustbo.campaign.learning import as_learned
+from trustbo.campaign.choose import choose, informed_planner
+from trustbo.campaign.learning import as_learned, learn_hazard
+from trustbo.campaign.past_failures import with_past_failures
 from trustbo.campaign.result import Result
 from trustbo.data import Cell, Mission, path_text
 from trustbo.errors import TrustboError
 from trustbo.hazard.path_risk import PathRisk
+from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import CAUSES
 from trustbo.inference import TrustFilter
-from trustbo.planning import Plan
+from trustbo.planning import Plan, Planner
 from trustbo.planning.plan import QUANTILES
+from trustbo.planning.policies import Policy
 from trustbo.planning.problem import Problem
 
 Pair = tuple[Cell, ...]
@@ -123,6 +127,49 @@ def failed_bounds(mission: Mission) -> list[Pair]:
     """Return the cells left and entered of each bound that failed."""
     bounds = zip(pairwise(mission.path), mission.statuses, strict=False)
     return [bound for bound, status in bounds if status in CAUSES]
+
+
+def plan_rest(
+    result: Result,
+    base: Planner,
+    policy: Policy,
+    plan: Plan,
+    cell: Cell,
+    so_far: Mission | None,
+    blocked: Sequence[Pair],
+) -> tuple[Plan, BoundRisk]:
+    """Plan the rest of a mission in progress; see `Campaign.replan` for the arguments and errors.
+
+    Args:
+        result: Campaign.
+        base: Planner of the campaign before any learning.
+        policy: Policy of the campaign.
+        plan: Plan of the mission so far.
+        cell: Cell in which the team is.
+        so_far: Bounds that were run; None if the team drove the plan up to the cell.
+        blocked: Further bounds that cannot be driven.
+
+    Returns:
+        The plan of the whole mission, and the failure probabilities that it was made with.
+    """
+    state = result.state
+    driven = follow(result, plan, cell, so_far, blocked)
+    n_driven = len(driven.path) - 1
+
+    risk = result.risk
+    if so_far is not None:
+        risk = BoundRisk(learn_hazard(state, result.workspace, so_far), result.workspace)
+    ahead = base.from_cell(
+        cell, x0=driven.filter.state.mean, blocked=driven.blocked, n_driven=n_driven
+    )
+    planner = informed_planner(ahead, risk)
+
+    rng = np.random.default_rng([state.seed_of("policy"), n_driven])
+    draws = driven.filter.resample()
+    rest = choose(policy, state.settings["policy"], rng, draws, planner)
+    rest = rest.with_draws(planner.evaluate(rest.path, draws))
+    whole = whole_plan(base.problem, driven, rest)
+    return with_past_failures(whole, state, planner, so_far), risk
 
 
 def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:

@@ -10,26 +10,17 @@ import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
 from trustbo.campaign.cache import computed
+from trustbo.campaign.choose import informed_planner, instead_of_failure
 from trustbo.campaign.folder import FolderStorage, without_lost_posteriors
-from trustbo.campaign.learning import (
-    add_entry,
-    fitted_missions,
-    informed_planner,
-    instead_of_failure,
-    learn_hazard,
-)
+from trustbo.campaign.learning import fitted_missions, learn_hazard
 from trustbo.campaign.past_failures import with_past_failures
-from trustbo.campaign.read import read_campaign
-from trustbo.campaign.record import RECORD
-from trustbo.campaign.settings import to_planner
 from trustbo.campaign.state import State
 from trustbo.data import NOWHERE, Cell, Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_kind
-from trustbo.files import FilePath, interpreting, to_path
+from trustbo.files import FilePath
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference.functions.function import is_of_function
-from trustbo.inference.learner import ClassLearner, Learner, Model, learner_from_record
+from trustbo.inference.learner import Learner
 from trustbo.inference.score import Posteriors
 from trustbo.models.backend import VERSIONS
 from trustbo.models.draws import Draws
@@ -93,7 +84,6 @@ class Result(Summary):
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._turn = threading.RLock()
-        self.state = self.state.copy()  # `copy.copy` passes the state of the original
         self._computed = dict(self._computed)
 
     def _rows(self) -> Rows:
@@ -114,7 +104,7 @@ class Result(Summary):
             best = f"{len(self.path) - 1} bounds, value {self.plan.value:z.3g}"
             rows.append(("recommended", best))
         if state.entries and state.last is not None:
-            rows.append(("last mission", in_a_line(state.entries[-1].row)))
+            rows.append(("last mission", in_a_line(state.row(len(state.entries) - 1))))
         return rows
 
     def _rows_of_earlier(self) -> Rows:
@@ -332,7 +322,7 @@ class Result(Summary):
         paths = [entry.plan.path for entry in entries]
         steps = np.stack([*zip_longest(*paths, fillvalue=NOWHERE)], axis=1)
         numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
-        table = pd.DataFrame([entry.shown_row for entry in entries], numbers)
+        table = pd.DataFrame([self.state.row(j) for j in range(len(entries))], numbers)
 
         history = table.drop(columns=["where", "n_bounds", "path"]).to_xarray()
         history["path"] = ("iteration", "step", "axis"), steps
@@ -361,9 +351,9 @@ class Result(Summary):
           measured bounds, and bounds that were not run lose all contact.
         - Diagnostics of the posterior; see `fit`.
         """
-        entries = enumerate(self.state.entries, start=1)
-        rows = [entry.shown_row | {"mission": n} for n, entry in entries]
-        for i, failure in enumerate(self.state.failures):  # after the mission that precedes it
+        state = self.state
+        rows = [state.row(j) | {"mission": j + 1} for j in range(len(state.entries))]
+        for i, failure in enumerate(state.failures):  # after the mission that precedes it
             rows.insert(failure.after + i, failure.row())
 
         columns = dict.fromkeys([*_FIRST_COLUMNS, *chain(*rows)])
@@ -449,50 +439,6 @@ class Result(Summary):
         with self._turn:
             state = without_lost_posteriors(self.state)
             FolderStorage.begin(directory, self.workspace, state, overwrite=overwrite).close()
-
-
-def load_result(
-    directory: FilePath, *, model: Model | None = None, progress: bool = True
-) -> Result:
-    """Read the result of a campaign from its folder, without locking the folder.
-
-    The campaign may still be running in another process.
-
-    Args:
-        directory: Folder of a campaign, or a folder written by `Result.save`.
-        model: Model of the campaign; needed if it is a NumPyro function, or if it is custom and
-            nothing has been learned.
-        progress: Whether to show a progress bar if `posterior` takes longer than 1.5 seconds.
-
-    Raises:
-        TrustboError: The folder contains no campaign, the campaign has no mission yet, or a file is
-            missing or damaged.
-
-    Example:
-        >>> result = tb.load_result("hills")
-        >>> result.table
-    """
-    state, workspace, pending, _ = read_campaign(directory)
-    for entry in pending:  # recorded, but not learned yet
-        add_entry(state, entry)
-
-    if not state.entries:
-        raise TrustboError(f"the campaign in {str(directory)!r} has no mission; run one first.")
-
-    with interpreting(to_path(directory) / RECORD):
-        given = state.settings
-        try:
-            learner = learner_from_record(given["model_record"], model)
-        except TrustboError:
-            # A model class with custom priors is needed only if nothing has been learned.
-            if state.last is None or model is not None or is_of_function(given["model_record"]):
-                raise
-            learner = ClassLearner(None)
-        base = to_planner(given, workspace)
-
-    result = Result(workspace, state, learner, base)
-    result._progress = progress
-    return result
 
 
 def in_a_line(row: dict[str, Any]) -> str:

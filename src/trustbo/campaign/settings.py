@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from trustbo.errors import TrustboError, require_kind, require_whole
+from trustbo.errors import TrustboError, require_kind
 from trustbo.files import to_json, to_plain
 from trustbo.hazard import Hazard
 from trustbo.inference.fit import fit, require_numbers_of_draws
 from trustbo.inference.learner import Learner
 from trustbo.planning import Planner
-from trustbo.planning.policies import Policy
+from trustbo.planning.policies import POLICIES, Policy
 from trustbo.workspace import Workspace
 
 _UNCHANGED = ("objective", "sampler", "seed", "initial", "awareness", "planner", "fit")
@@ -73,18 +73,7 @@ def _require_options(
 
 
 def to_settings(
-    base: Planner,
-    learner: Learner,
-    policy: str | Policy,
-    *,
-    objective: str,
-    sampler: str,
-    seed: int,
-    initial: str,
-    awareness: str,
-    hazard: Hazard,
-    planner: dict[str, Any],
-    fit: dict[str, Any],
+    base: Planner, learner: Learner, policy: str | Policy, hazard: Hazard, **options: Any
 ) -> dict[str, Any]:
     """Return the settings of a campaign as if they were read from a file.
 
@@ -92,34 +81,25 @@ def to_settings(
         base: Planner before any learning.
         learner: Learner of the model.
         policy: Policy that chooses the paths.
-        objective: Objective of the paths.
-        sampler: Sampler of the posterior.
-        seed: Seed of all random numbers.
-        initial: Parameters for the first plan.
-        awareness: Awareness from which the model learns.
         hazard: Priors of the failure probabilities.
-        planner: Further options of the planner.
-        fit: Further options of `fit`.
+        **options: Other arguments of `Campaign`, which are stored unchanged: `objective`,
+            `sampler`, `seed`, `initial`, `awareness`, `planner` and `fit`.
 
     Raises:
-        TrustboError: The seed is not a whole number, or an option cannot be stored in a file.
+        TrustboError: An option cannot be stored in a file.
     """
-    if "bound_cost" in planner:
+    if "bound_cost" in options["planner"]:
         # In the order of the moves, rows and columns.
-        planner = planner | {"bound_cost": base.problem.bound_cost}
+        options["planner"] = options["planner"] | {"bound_cost": base.problem.bound_cost}
+    for name in ("planner", "fit"):
+        options[name] = to_plain(name, options[name])
 
     settings = {
         "start": base.start,
         "goal": base.goal,
         "max_bounds": base.max_bounds,
-        "policy": policy if isinstance(policy, str) else f"{name_of(policy)} (custom)",
-        "objective": objective,
-        "sampler": sampler,
-        "seed": require_whole("seed", seed, 0),
-        "initial": initial,
-        "awareness": awareness,
-        "planner": to_plain("planner", planner),
-        "fit": to_plain("fit", fit),
+        "policy": _text_of(policy),
+        **options,
         "hazard": asdict(hazard),
         "family": learner.family,
         "model": learner.in_short(),
@@ -128,12 +108,28 @@ def to_settings(
     return json.loads(to_json(settings))
 
 
-def to_arguments(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of `Campaign`, except for workspace, model and policy."""
+def _text_of(policy: str | Policy) -> str:
+    """Return the name of a policy in the settings."""
+    return policy if isinstance(policy, str) else f"{name_of(policy)} (custom)"
+
+
+def to_arguments(settings: Mapping[str, Any], policy: Policy | None) -> dict[str, Any]:
+    """Return the arguments of a stored `Campaign`, except for workspace and model.
+
+    Raises:
+        TrustboError: The policy is custom and is not given, or another one is given.
+    """
+    stored = settings["policy"]
+    if policy is None and stored not in POLICIES:
+        raise TrustboError(f"the policy {stored!r} is not stored; pass the function as policy=.")
+    if policy is not None and _text_of(policy) != stored:
+        raise TrustboError(f"policy {_text_of(policy)!r} is not the campaign's, {stored!r}.")
+
     return {
         "start": settings["start"],
         "goal": settings["goal"],
         "hazard": Hazard(**settings["hazard"]),
+        "policy": stored if policy is None else policy,
         **{name: settings[name] for name in _UNCHANGED},
     }
 

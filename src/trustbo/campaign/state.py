@@ -1,13 +1,16 @@
 """State of a campaign: missions with plans and posteriors, and missions given up."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell, Mission, path_text
+from trustbo.errors import TrustboError
+from trustbo.files import read_file
 from trustbo.hazard.trials import LostMission
 from trustbo.logs.netcdf import read_tree
 from trustbo.planning import Plan
@@ -57,32 +60,24 @@ class Failure(NamedTuple):
         }
 
 
-class StoredFile(NamedTuple):
-    """File of a campaign.
-
-    Attributes:
-        path: Path of the file.
-        sha256: Hash of its content.
-    """
-
-    path: Path
-    sha256: str
-
-
 @dataclass(eq=False)
 class Posterior:
-    """Posterior of the parameters after a mission.
+    """Posterior of the parameters, which is computed from some of the missions.
 
     Attributes:
         name: Name of its file: the number of missions recorded when it was fitted, followed by the
             number of excluded missions if there are any, such as `"0003-1"`.
+        used: Indices of the campaign's missions to which it was fitted, without earlier ones.
+        diagnostics: Diagnostics of the sampler; see `inference.diagnostics`.
         tree: Draws in memory; None if they are stored only in `file`.
-        file: File of the draws; None if they have not been written.
+        file: Path and hash of the file of the draws; None if they have not been written.
     """
 
     name: str
+    used: tuple[int, ...] = ()
+    diagnostics: dict[str, float] = field(default_factory=dict)
     tree: xr.DataTree | None = None
-    file: StoredFile | None = None
+    file: tuple[Path, str] | None = None
 
     def __call__(self) -> xr.DataTree:
         """Return the draws; raises TrustboError if the file cannot be read."""
@@ -91,6 +86,22 @@ class Posterior:
         if self.file is None:
             raise ValueError("a posterior is in memory or in a file")
         return read_tree(*self.file)
+
+    @property
+    def after(self) -> int:
+        """Number of missions recorded when it was fitted."""
+        return int(self.name.split("-")[0])
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the draws are only in a file that cannot be read any more."""
+        if self.tree is not None or self.file is None:
+            return False
+        try:
+            read_file(*self.file)
+        except TrustboError:
+            return True
+        return False
 
 
 def incomplete_bounds(mission: Mission) -> list[tuple[int, Cell, str]]:
@@ -101,7 +112,29 @@ def incomplete_bounds(mission: Mission) -> list[tuple[int, Cell, str]]:
     ]
 
 
-@dataclass(eq=False)
+def why_never_learned(mission: Mission) -> str:
+    """Return why a mission can never be used for learning, or an empty string."""
+    if not np.isfinite(mission.contact_rate).any():
+        return "no contact rate was measured."
+    if np.isnan(mission.awareness).any():
+        k = int(np.argwhere(np.isnan(mission.awareness))[0, 0])
+        return f"the map has no awareness in cell {mission.bounds[k].cell} of bound {k + 1}."
+    return ""
+
+
+class Exclusion(NamedTuple):
+    """Exclusion of a mission by a user.
+
+    Attributes:
+        after: Number of missions recorded before it.
+        reason: Reason, as given by the user.
+    """
+
+    after: int
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
 class Entry:
     """Recorded mission, with its plan and the posterior after it.
 
@@ -110,8 +143,7 @@ class Entry:
         measured: Mission with the measured awareness.
         mission: Mission with the awareness used for learning; see `learning.as_learned`.
         trust_map: Trust map used for planning, dims (row, col).
-        row: Values of the mission in `Result.table`, keyed by column, including the `state`
-            (`TOLD`, `LEARNED` or `EXCLUDED`) and the `reason` for this state.
+        exclusion: Exclusion by a user; None if there was none.
         posterior: Posterior after this mission; None if there is none yet.
     """
 
@@ -119,19 +151,39 @@ class Entry:
     measured: Mission
     mission: Mission
     trust_map: xr.DataArray
-    row: dict[str, Any]
+    exclusion: Exclusion | None = None
     posterior: Posterior | None = None
 
-    @property
-    def shown_row(self) -> dict[str, Any]:
-        """The row, where a blank reason is replaced by the statuses of incomplete bounds."""
-        statuses = [status for _, _, status in incomplete_bounds(self.mission)]
-        reason = self.row["reason"] or ", ".join(dict.fromkeys(statuses))
-        return self.row | {"reason": reason}
+    @cached_property
+    def why_excluded(self) -> str | None:
+        """Reason why the mission is not used for learning; None if it is used."""
+        if self.exclusion is not None:
+            return self.exclusion.reason
+        return why_never_learned(self.mission) or None
 
-    def become(self, state: str, reason: str = "") -> None:
-        """Change the state of the mission, in a new row, so that the change can be undone."""
-        self.row = self.row | {"state": state, "reason": reason}
+    @cached_property
+    def measures(self) -> dict[str, Any]:
+        """Values of the mission in `Result.table`, by column, that depend on nothing else."""
+        plan = self.plan
+        mission = self.mission
+
+        n_planned = len(mission.path) - 1
+        if mission.path[-1] != plan.path[-1]:  # the path no longer contained the goal
+            n_planned = max(n_planned, len(plan.path) - 1)
+        rates = mission.contact_rate
+        failed = [cell for _, cell, _ in incomplete_bounds(mission)]
+        contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
+
+        return {
+            "objective": plan.value,
+            "contact_rate": contact,
+            "contact_lost": _contact_lost(rates, n_planned),
+            "status": mission.status,
+            "where": path_text(failed),
+            "n_bounds": len(mission.bounds),
+            "n_unmeasured": int(np.isnan(rates).all(axis=1).sum()),
+            "path": path_text(plan.path),
+        }
 
 
 class EarlierMissions(NamedTuple):
@@ -147,9 +199,13 @@ class EarlierMissions(NamedTuple):
     lost: tuple[LostMission, ...] = ()
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class State:
-    """Data of a campaign: the contents of its folder, except for the workspace.
+    """What happened in a campaign: the contents of its folder, except for the workspace.
+
+    A change is a new state. The posterior is a function of the missions that are used, the settings
+    and the seed. It is up to date if the last fit, whether or not it succeeded, was of these
+    missions.
 
     Attributes:
         settings: Arguments of the campaign, JSON-serialisable.
@@ -158,21 +214,27 @@ class State:
         asked: Plan returned by `ask` and not run yet.
         simulation: Settings reported by the simulator, and `n_iterations`.
         stop_reason: Reason why the last run ended.
-        due: Seed of the fit that is due because the missions have changed; None if the posterior
-            is up to date, or if learning is retried after the next mission.
+        fitted: Indices of the missions of the last fit.
+        why_not: Reason why this fit failed; empty if it succeeded.
         earlier: Missions of earlier campaigns, which enter every fit.
         initial: Posterior given the missions of earlier campaigns; None if there are none.
     """
 
     settings: dict[str, Any]
-    entries: list[Entry] = field(default_factory=list)
-    failures: list[Failure] = field(default_factory=list)
+    entries: tuple[Entry, ...] = ()
+    failures: tuple[Failure, ...] = ()
     asked: Plan | None = None
     simulation: dict[str, Any] = field(default_factory=dict)
     stop_reason: str = "interrupted"
-    due: int | None = None
+    fitted: tuple[int, ...] | None = ()
+    why_not: str = ""
     earlier: EarlierMissions = field(default_factory=EarlierMissions)
     initial: Posterior | None = None
+
+    @property
+    def used(self) -> tuple[int, ...]:
+        """Indices of the missions that are not excluded."""
+        return tuple(j for j, entry in enumerate(self.entries) if entry.why_excluded is None)
 
     @property
     def last(self) -> Posterior | None:
@@ -180,7 +242,7 @@ class State:
         return self.entries[-1].posterior if self.entries else self.initial
 
     @property
-    def stored(self) -> list[Posterior]:
+    def posteriors(self) -> list[Posterior]:
         """All posteriors, in order and without duplicates."""
         found = [self.initial, *(entry.posterior for entry in self.entries)]
         return list(dict.fromkeys(posterior for posterior in found if posterior is not None))
@@ -196,51 +258,57 @@ class State:
         own = [failure.lost for failure in self.failures if failure.lost is not None]
         return [*self.earlier.lost, *own]
 
-    def copy(self) -> Self:
-        """Return a state whose missions and failures can change independently of this one."""
-        entries = [replace(entry) for entry in self.entries]
-        return replace(self, entries=entries, failures=list(self.failures))
+    def status_of(self, j: int) -> tuple[str, str]:
+        """Return the state of the mission with index j, and the reason for it, which may be ""."""
+        excluded = self.entries[j].why_excluded
+        if excluded is not None:
+            return EXCLUDED, excluded
+        if self.last is not None and j in self.last.used:
+            return LEARNED, ""
+        return TOLD, self.why_not
 
-    def indices(self, *states: str) -> list[int]:
-        """Return the indices of the missions in one of these states."""
-        return [j for j, entry in enumerate(self.entries) if entry.row["state"] in states]
+    def row(self, j: int) -> dict[str, Any]:
+        """Return the row of the mission with index j in `Result.table`.
 
-    def seed_of(self, stream: str) -> int:
-        """Return the seed of one random stream for the next mission."""
-        n = len(self.entries)
+        A blank reason is replaced by the statuses of incomplete bounds.
+        """
+        entry = self.entries[j]
+        state, reason = self.status_of(j)
+        if not reason:
+            statuses = [status for _, _, status in incomplete_bounds(entry.mission)]
+            reason = ", ".join(dict.fromkeys(statuses))
+
+        posterior = entry.posterior
+        is_own = posterior is not None and posterior.after == j + 1
+        before = self.entries[max(j - 1, 0)]
+        return {
+            **entry.measures,
+            "path_changed": entry.plan.path != before.plan.path,
+            "state": state,
+            "reason": reason,
+            **(posterior.diagnostics if posterior and is_own else {}),
+        }
+
+    def seed_of(self, stream: str, n: int | None = None) -> int:
+        """Return the seed of one random stream after `n` missions; by default, after all so far."""
+        n = len(self.entries) if n is None else n
         entropy = [self.settings["seed"], _STREAMS.index(stream), n]
         if stream == "exclude":  # several fits may follow one mission
-            entropy.append(len(self.indices(EXCLUDED)))
+            entropy.append(len(self.entries) - len(self.used))
 
         n_failures = sum(failure.after == n for failure in self.failures)
         if n_failures:
             entropy.append(n_failures)  # after `fail`, a random policy may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
-    def row_of(self, plan: Plan, mission: Mission) -> dict[str, Any]:
-        """Return the row of a new mission for `Result.table`."""
-        before = self.entries[-1].plan if self.entries else plan
-
-        n_planned = len(mission.path) - 1
-        if mission.path[-1] != plan.path[-1]:  # the path no longer contained the goal
-            n_planned = max(n_planned, len(plan.path) - 1)
-        rates = mission.contact_rate
-        failed = [cell for _, cell, _ in incomplete_bounds(mission)]
-        contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
-
-        return {
-            "objective": plan.value,
-            "path_changed": plan.path != before.path,
-            "contact_rate": contact,
-            "contact_lost": _contact_lost(rates, n_planned),
-            "status": mission.status,
-            "state": TOLD,
-            "reason": "",
-            "where": path_text(failed),
-            "n_bounds": len(mission.bounds),
-            "n_unmeasured": int(np.isnan(rates).all(axis=1).sum()),
-            "path": path_text(plan.path),
-        }
+    @property
+    def seed_of_fit(self) -> int:
+        """Seed of the posterior of the missions that are used now."""
+        n = len(self.entries)
+        exclusions = [entry.exclusion for entry in self.entries if entry.exclusion is not None]
+        if any(exclusion.after == n for exclusion in exclusions):
+            return self.seed_of("exclude")
+        return self.seed_of("fit", max(n - 1, 0))
 
 
 def _contact_lost(rates: np.ndarray, n_planned: int) -> float:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from trustbo.errors import require_share
+from trustbo.errors import TrustboError, require_share
 from trustbo.planning import InfeasibleError
 from trustbo.workspace.moves import bounds_and_next
 
@@ -20,6 +20,12 @@ _N_DRAWS = 500
 """Number of posterior draws; the best path is planned under each of them."""
 _N_SURE = 2
 """Successive missions after which the probability must be large enough."""
+
+
+def require_stop(stop: Stop | None) -> None:
+    """Raise TrustboError unless a stopping rule can be called with a campaign."""
+    if stop is not None and (isinstance(stop, type) or not callable(stop)):
+        raise TrustboError(f"stop must be a function of the campaign; got {stop!r}.")
 
 
 @dataclass(frozen=True)

@@ -218,7 +218,7 @@ def _rows(
             path = _path_of(campaign)
             seconds = time.process_time() - began
 
-            contact_rate = campaign.state.entries[-1].row["contact_rate"]
+            contact_rate = campaign.state.entries[-1].measures["contact_rate"]
             yield {
                 "mission": number,
                 **_recommended(path, scene, number),

@@ -1,0 +1,123 @@
+"""Recording of what happens in a campaign: it is written, and then learned from."""
+
+from dataclasses import replace
+from typing import Any, Self
+
+from trustbo.campaign.folder import FolderStorage, MemoryStorage
+from trustbo.campaign.learning import with_posterior
+from trustbo.campaign.result import Result
+from trustbo.campaign.state import State
+from trustbo.errors import TrustboError, warn
+from trustbo.files import FilePath, holding_interrupts
+from trustbo.inference.learner import Learner
+from trustbo.planning import Planner
+from trustbo.workspace import Workspace
+
+
+class Recorder(Result):
+    """Result whose state changes, in memory or in a folder.
+
+    Attributes:
+        storage: `FolderStorage` of the campaign, or a `MemoryStorage`.
+    """
+
+    def __init__(self, workspace: Workspace, state: State, learner: Learner, base: Planner) -> None:
+        """Store the state in memory; see `Result`."""
+        super().__init__(workspace, state, learner, base)
+        self.storage: FolderStorage | MemoryStorage = MemoryStorage()
+
+    def store_in(self, directory: FilePath, *, overwrite: bool = False) -> None:
+        """Write the campaign to a folder, and record everything there from now on.
+
+        A folder that the campaign used before remains as it is, and is released.
+
+        Args:
+            directory: Folder, as in the constructor of a campaign.
+            overwrite: Whether to replace an existing campaign in that folder.
+
+        Raises:
+            TrustboError: The folder already contains a campaign or cannot be written.
+        """
+        with self._turn:
+            storage = FolderStorage.begin(
+                directory, self.workspace, self.state, overwrite=overwrite, take_over=overwrite
+            )
+            storage.adopt(self.state)
+
+            before = self.storage
+            self._use(storage)
+            before.close()
+
+    def _use(self, storage: FolderStorage) -> None:
+        """Record everything in a folder from now on."""
+        self.storage = storage
+        self._turn = storage.turn
+
+    def _record(self, **changes: Any) -> None:
+        """Change the state and write it; if this fails, nothing has changed."""
+        state = replace(self.state, **changes)
+        with holding_interrupts():
+            self.storage.write(state)
+            self.state = state
+            if "entries" in changes or "failures" in changes:
+                self._computed.clear()
+
+    def _use_posterior(self) -> None:
+        """Compute the posterior of the missions that are used now; see `with_posterior`."""
+        hazard = self.hazard  # does not depend on what was learned about trust
+        state = with_posterior(self.state, self.learner, self.workspace, hazard, self._progress)
+        with holding_interrupts():
+            self.state = state
+            self._computed = {"hazard": hazard}
+
+    def _learn(self) -> None:
+        """Learn from the missions, unless this has been done."""
+        if self.state.fitted == self.state.used:
+            return
+
+        self._use_posterior()
+        if self.state.why_not:
+            warn(
+                f"all is recorded, but the posterior after mission {len(self.state.entries)} "
+                f"cannot be computed yet: {self.state.why_not.rstrip('.')}. Learning is retried "
+                "after the next mission."
+            )
+
+    def _learn_and_write(self, what: str) -> None:
+        """Learn after something was recorded; `what` describes it in messages.
+
+        The next call repeats what fails here, so a failure must not look like a failed call.
+        """
+        try:
+            self._learn()
+            with holding_interrupts():
+                self.storage.write(self.state)
+        except TrustboError as error:
+            warn(
+                f"{what}, and what was learned is in memory, but it could not be written: {error} "
+                "The next call writes it."
+            )
+        except BaseException as error:
+            error.add_note(f"{what}; it will be learned at the next call.")
+            raise
+
+    def close(self) -> None:
+        """Release the folder, so that others can use it; a campaign in memory can go on.
+
+        The results can still be used. Further calls have no effect.
+        """
+        with self._turn:
+            self.storage.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return super().__getstate__() | {"storage": None}  # the copy is in memory
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self.storage = MemoryStorage()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()

@@ -1,0 +1,77 @@
+"""Missions of a campaign in a simulator."""
+
+import json
+from collections.abc import Generator
+from typing import TYPE_CHECKING, Any
+
+from trustbo.campaign.result import in_a_line
+from trustbo.campaign.settings import name_of
+from trustbo.campaign.stopping import Stop
+from trustbo.data import Mission
+from trustbo.display import bar as progress_bar
+from trustbo.display import refreshing
+from trustbo.errors import TrustboError
+from trustbo.files import to_json
+from trustbo.planning import Plan
+from trustbo.simulation import KinematicSimulator, RealtimeAwareness
+from trustbo.simulation.protocol import Simulator
+
+if TYPE_CHECKING:
+    from trustbo.campaign.campaign import Campaign
+
+
+def require_simulator(campaign: "Campaign", simulator: Simulator | None) -> Simulator:
+    """Return the simulator of a campaign; by default, the kinematic one.
+
+    The default robots measure awareness if the campaign learns from it. Raises TrustboError for
+    another object.
+    """
+    if simulator is None:
+        usual = KinematicSimulator(campaign.workspace)
+        is_measured = campaign.state.settings["awareness"] == "measured"
+        return RealtimeAwareness(usual) if is_measured else usual
+
+    if isinstance(simulator, type) or not callable(getattr(simulator, "run", None)):
+        raise TrustboError(
+            f"simulator needs a method run(path, *, seed, mission) -> Mission; got {simulator!r}."
+        )
+    return simulator
+
+
+def settings_of(simulator: Simulator, n_iterations: int) -> dict[str, Any]:
+    """Return the settings of a simulation as if they were read from a file."""
+    describe = getattr(simulator, "describe", lambda: {"simulator": type(simulator).__name__})
+    return json.loads(to_json({**describe(), "n_iterations": n_iterations}))
+
+
+def run_missions(
+    campaign: "Campaign",
+    simulator: Simulator,
+    n_iterations: int,
+    stop: Stop | None,
+    progress: bool,
+) -> Generator[tuple[Plan, Mission], None, str]:
+    """Run missions for `Campaign.run`; returns the reason why they ended."""
+    options = {"total": n_iterations, "initial": len(campaign.missions), "desc": "missions"}
+    with progress_bar(progress, **options) as bar, refreshing(bar):
+        # Check the rule before each mission: it may already apply when a campaign is resumed.
+        while not (reason := _reason_to_end(campaign, n_iterations, stop)):
+            plan = campaign.ask()
+            n = len(campaign.state.entries)
+            seed = campaign.state.seed_of("mission")
+            mission = simulator.run(plan.path, seed=seed, mission=n)
+            campaign.tell(mission, again=True)  # a simulator without noise may repeat itself
+            bar.set_postfix_str(in_a_line(campaign.state.row(n)), refresh=False)
+            bar.update()
+            yield plan, mission
+    return reason
+
+
+def _reason_to_end(campaign: "Campaign", n_iterations: int, stop: Stop | None) -> str | None:
+    """Return the reason to stop, or None to continue."""
+    n = len(campaign.state.entries)
+    if n and stop is not None:
+        verdict = stop(campaign)
+        if verdict:
+            return verdict if isinstance(verdict, str) else name_of(stop)
+    return "n_iterations" if n >= n_iterations else None
