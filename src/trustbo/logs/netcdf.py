@@ -9,17 +9,13 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
-from trustbo.files import FilePath, hash_of, interpreting, read_file, to_path, write_file
+from trustbo.files import FilePath, interpreting, read_file, to_path, write_file
 from trustbo.stacking import require_same_team
 
 _ARRAYS = {"awareness": "1", "contact_rate": "1", "duration": "s", "n_ticks": "1"}
 """Arrays of a bound, (robot,) or (robot, feature), and their units."""
 _TEXTS = ("status", "scale", "map")
 """Texts of a mission."""
-_SEAL = b"sha256:"
-"""Beginning of the hash that follows the content of a file."""
-_SEAL_LENGTH = len(_SEAL) + 64
-"""Length of the hash in bytes, 64 of which are hexadecimal digits."""
 
 
 def read_tree(path: FilePath, sha256: str = "") -> xr.DataTree:
@@ -29,9 +25,9 @@ def read_tree(path: FilePath, sha256: str = "") -> xr.DataTree:
         TrustboError: The file is missing or damaged, or `sha256` is given and is not its hash.
     """
     content = read_file(path, sha256)
-
     try:
-        return tree_from_bytes(content)
+        with xr.open_datatree(content, engine="netcdf4") as tree:
+            return tree.load()
     except Exception:  # the library raises many types of errors for bad files
         raise TrustboError(f"{str(path)!r} is damaged or not a netCDF file.") from None
 
@@ -41,54 +37,20 @@ def write_tree(path: FilePath, tree: xr.DataTree) -> None:
     write_file(path, tree_to_bytes(tree))
 
 
-def tree_from_bytes(content: bytes) -> xr.DataTree:
-    """Read the content of a netCDF file of groups into memory; raises various errors."""
-    seal = content[-_SEAL_LENGTH:]
-    if seal.startswith(_SEAL):
-        content = content[:-_SEAL_LENGTH]
-        if seal != _seal_of(content):
-            raise ValueError("the hash at the end of the file is not that of its content")
-
-    with xr.open_datatree(content, engine="netcdf4") as tree:
-        return tree.load()
-
-
 def tree_to_bytes(tree: xr.DataTree) -> bytes:
-    """Return the content of a netCDF file with checksums.
+    """Return the content of a netCDF file.
 
-    Other programs check the checksums of the numbers. They ignore the hash of the whole content at
-    the end, which also covers texts, shapes and indices.
-
-    The content is made in memory, because the netCDF library keeps a file open if the disk is full.
+    It is made in memory, because the netCDF library keeps a file open if the disk is full.
     """
     encoding: dict[str, Any] = {}
     for group in tree.subtree:
         variables = group.to_dataset(inherit=False).variables
         encoding[group.path] = {
-            name: {"fletcher32": True, "zlib": variable.dtype.kind in "iu"}  # such as draw numbers
+            name: {"zlib": True}  # such as draw numbers
             for name, variable in variables.items()
-            if variable.ndim and variable.dtype.kind in "biufM"  # texts and scalars have none
+            if variable.ndim and variable.dtype.kind in "iu"
         }
-
-    content = _without_padding(bytes(tree.to_netcdf(engine="netcdf4", encoding=encoding)))
-    return content + _seal_of(content)
-
-
-def _without_padding(content: bytes) -> bytes:
-    """Remove the zeros that fill a file made in memory to a multiple of 64 kB.
-
-    The first block of an HDF5 file says where it ends (HDF5 file format 3.0, II.A, versions 2, 3).
-    """
-    version = content[8]
-    end = int.from_bytes(content[28:36], "little")
-
-    if version not in (2, 3) or any(content[end:]):
-        return content
-    return content[:end]
-
-
-def _seal_of(content: bytes) -> bytes:
-    return _SEAL + hash_of(content).encode()
+    return bytes(tree.to_netcdf(engine="netcdf4", encoding=encoding))
 
 
 def write_missions(path: FilePath, missions: Iterable[Mission]) -> None:
