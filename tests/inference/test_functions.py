@@ -891,6 +891,29 @@ def test_attributes_that_cannot_be_pickled_do_not_hide_the_others(of):
     assert fingerprint(of(1.0)) == fingerprint(of(1.0)) != fingerprint(of(20.0))
 
 
+def with_link(power):
+    class Link:
+        def __call__(self, x):
+            return x**power
+
+    return lambda awareness, contact_rate=None: Link()(awareness)
+
+
+def test_a_class_of_the_same_module_that_changes_changes_the_fingerprint():
+    assert fingerprint(with_link(1)) == fingerprint(with_link(1)) != fingerprint(with_link(2))
+
+
+def halved(x, n):
+    return halved(0.5 * x, n - 1) if n else x
+
+
+def test_a_function_that_calls_itself_has_a_fingerprint(monkeypatch):
+    before = fingerprint(halved)
+    assert fingerprint(halved) == before
+    monkeypatch.setattr(halved, "__defaults__", (3,))
+    assert fingerprint(halved) != before
+
+
 def test_an_object_that_changes_changes_its_fingerprint():
     model = Saturating(1.0)
     before = fingerprint(model)
