@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -41,6 +42,19 @@ def assert_is_of_its_path(plan, workspace):
 def test_a_plan_has_what_each_robot_is_to_do(plan, workspace):
     assert_is_of_its_path(plan, workspace)
     assert plan.posts is plan.posts  # computed once
+
+
+def test_a_table_of_a_plan_has_its_stops_and_the_trust_after_each_bound(plan):
+    driven = replace(plan, n_driven=1)
+    table = driven.to_frame()
+    assert table["cell"].tolist() == [f"{row},{col}" for row, col in plan.path]
+    np.testing.assert_array_equal(table[["x", "y"]], plan.stops)
+    assert table.loc[0, "trust":].isna().all()
+    np.testing.assert_array_equal(table.loc[1:, "trust_r2"], plan.trust[:, 1])
+    np.testing.assert_array_equal(table.loc[1:, "trust_r2_low"], plan.bands[0, :, 1])
+    np.testing.assert_allclose(list(table.loc[1:, "trust_high"]), plan.bands[-1].mean(1))
+    assert table["driven"].tolist()[1:] == [True, *[False] * (len(plan.path) - 2)]
+    assert "p_fail" not in table
 
 
 def test_a_record_has_no_ways_and_the_plan_read_from_it_does(plan, workspace):

@@ -4,6 +4,7 @@ import json
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import rioxarray  # noqa: F401  (registers the .rio accessor)
 import shapely
 import xarray as xr
@@ -15,13 +16,11 @@ from trustbo.errors import TrustboError, require_kind
 from trustbo.files import FilePath, to_path, write_file, write_text
 from trustbo.logs.table import to_frame
 from trustbo.planning import Plan
-from trustbo.planning.plan import QUANTILES
 from trustbo.terrain.place import converted, quiet_affine
 
 _NO_CRS = "this export needs a CRS; make the workspace with Workspace.from_terrain."
 _TIFF = (".tif", ".tiff")
 """Suffixes of a GeoTIFF."""
-_BAND = {"low": QUANTILES.index(0.05), "high": QUANTILES.index(0.95)}
 
 
 def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
@@ -100,12 +99,14 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     name = "recommended path" if isinstance(plan, Result) else "planned path"
     plan = plan.plan if isinstance(plan, Result) else plan
     require_kind("plan", plan, Plan, "give a Plan, for example from Campaign.ask, or a Result")
-    centres = np.array([plan.workspace.grid.center(cell) for cell in plan.path])
     facts = {"name": name, "n_bounds": len(plan.path) - 1, "n_driven": plan.n_driven}
     facts |= {"value": float(plan.value), "objective": plan.objective}
-    features = [_feature(plan, "path", centres, facts | {"length_m": float(plan.length)})]
-    for about, place in zip(_cells(plan), centres, strict=True):
-        features.append(_feature(plan, "bounds", place, about))
+    features = [_feature(plan, "path", plan.positions, facts | {"length_m": float(plan.length)})]
+
+    rows = plan.to_frame().loc[:, "driven":].to_dict("records")
+    for k, (cell, place, row) in enumerate(zip(plan.path, plan.positions, rows, strict=True)):
+        known = {name: value for name, value in row.items() if pd.notna(value)}
+        features.append(_feature(plan, "bounds", place, {"bound": k, **known, "cell": [*cell]}))
 
     team = plan.workspace.team
     for k, (cell, places) in enumerate(zip(plan.path, _of(plan.posts), strict=False), start=1):
@@ -143,47 +144,18 @@ def write_csv(path: FilePath, result: Result) -> None:
     """
     require_kind("result", result, Result, "give a result or a campaign")
     table = to_frame(result.missions)
-    latent = result.posterior["latent"].to_dataset()
+    latent = result.posterior["latent"].to_dataset()[["trust_mean", "trust_sd"]]
 
     # The posterior lacks missions that are excluded or not learned from yet.
-    of_mission = {int(j) + 1: i for i, j in enumerate(latent["mission"].values)}
-
-    keys = table[["mission", "bound", "robot"]].itertuples(index=False, name=None)
-    robots = result.workspace.team.names
-    at = [(of_mission.get(j, -1), k - 1, robots.index(robot)) for j, k, robot in keys]
-
-    for name in ("trust_mean", "trust_sd"):
-        values = latent[name].values
-        n_bounds = latent.sizes["bound"]
-        table[name] = [
-            values[i, k, r] if i >= 0 and 0 <= k < n_bounds else np.nan for i, k, r in at
-        ]
-
-    write_text(path, table.to_csv(index=False, lineterminator="\n"))
+    numbered = latent.assign_coords(mission=latent["mission"] + 1)
+    keys = ["mission", "bound", "robot"]
+    trust = numbered.to_dataframe(dim_order=keys)[["trust_mean", "trust_sd"]]
+    write_text(path, table.join(trust, on=keys).to_csv(index=False, lineterminator="\n"))
 
 
 def _of(values: Any) -> Any:
     """Return posts or routes of a plan; an empty tuple if the plan has no terrain."""
     return () if values is None else values
-
-
-def _cells(plan: Plan) -> list[dict[str, Any]]:
-    """Return the GeoJSON properties of the cells of a path; unknown values are left out."""
-    columns: dict[str, np.ndarray] = {}
-    for i, robot in enumerate(plan.workspace.team.names):
-        columns[f"trust_{robot}"] = plan.trust[:, i]
-        columns |= {f"trust_{robot}_{end}": plan.bands[q, :, i] for end, q in _BAND.items()}
-
-    if plan.risk is not None:
-        columns["p_fail"] = plan.risk.p_fail
-
-    rows: list[dict[str, Any]] = []
-    for k, cell in enumerate(plan.path):
-        values = {name: float(v[k - 1]) for name, v in columns.items() if k}
-        known = {name: value for name, value in values.items() if value == value}
-        driven = {"driven": k <= plan.n_driven} if k else {}
-        rows.append({"bound": k, **driven, **known, "cell": [*cell]})
-    return rows
 
 
 def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) -> dict[str, Any]:

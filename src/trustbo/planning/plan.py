@@ -4,9 +4,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+import pandas as pd
 
 from trustbo.data import Cell, path_text
 from trustbo.display import Rows, Summary, joined
@@ -105,13 +107,9 @@ class Plan(Summary):
         if np.isnan(self.limit):
             best = "not known: the path was given or chosen by a policy"
 
-        within = ""
-        if self.value_band is not None:
-            within = ", {:z.3g} to {:z.3g} in 90 % of the draws".format(*self.value_band)
-
         rows = [
             ("path", f"{path_text(self.path)}: {len(self.path) - 1} bounds, {self.length:.0f} m"),
-            ("value", f"{self.value:z.3g} ({self.objective})" + within),
+            ("value", f"{self.value:z.3g} ({self.objective}){in_draws(self.value_band)}"),
             ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]
@@ -125,6 +123,43 @@ class Plan(Summary):
             rows.append(("search", f"{1e3 * self.seconds:.1f} ms"))
 
         return rows
+
+    def to_frame(self) -> pd.DataFrame:
+        """Return a table with one row for each cell, labelled by the bound that enters it, from 0.
+
+        The columns are:
+
+        - `cell`: cell as text, such as "9,0".
+        - `x`, `y`: stop of the lead or, without a terrain, centre of the cell, in CRS metres.
+        - `trust`, `trust_low`, `trust_high`: expected trust after the bound and the ends of its
+          90 % interval, means of the robots.
+        - `driven`: whether the bound had been driven when the mission was replanned.
+        - `trust_r1`, `trust_r1_low`, `trust_r1_high`: the same as `trust`, of the robot r1; and so
+          on.
+        - `p_fail`: probability that the bound, once begun, ends the mission; left out if the
+          planner has no risk.
+
+        At the start, the columns from `trust` on are missing.
+
+        Example:
+            >>> campaign.ask().to_frame().to_csv("path.csv")
+        """
+        of_bounds = self._trust_columns("trust", np.s_[:])
+        of_bounds["driven"] = np.arange(1, len(self.path)) <= self.n_driven
+        for i, robot in enumerate(self.workspace.team.names):
+            of_bounds |= self._trust_columns(f"trust_{robot}", np.s_[i : i + 1])
+        if self.p_fail is not None:
+            of_bounds["p_fail"] = self.p_fail
+
+        places = self.positions if self.stops is None else self.stops
+        table = pd.DataFrame(places, columns=["x", "y"]).rename_axis("bound")
+        table.insert(0, "cell", [path_text([cell]) for cell in self.path])
+        return table.join(pd.DataFrame(of_bounds, index=table.index[1:]))
+
+    def _trust_columns(self, name: str, robots: slice) -> dict[str, np.ndarray]:
+        """Return the mean trust of some robots and its 90 % interval, keyed by column."""
+        values = {name: self.trust, f"{name}_low": self.bands[0], f"{name}_high": self.bands[-1]}
+        return {column: value[:, robots].mean(1) for column, value in values.items()}
 
     @cached_property
     def positions(self) -> np.ndarray:
@@ -142,6 +177,11 @@ class Plan(Summary):
     def revisits(self) -> int:
         """Number of bounds that enter a cell that the path has already visited."""
         return len(self.path) - len(set(self.path))
+
+    @property
+    def is_replanned(self) -> bool:
+        """Whether bounds had been driven, or were blocked, when a campaign made this plan."""
+        return self.n_driven > 0 or bool(self.blocked)
 
     @property
     def p_fail(self) -> np.ndarray | None:
@@ -167,8 +207,7 @@ class Plan(Summary):
         posts = self.workspace.posts
         if posts is None:
             return None
-        bounds = zip(self.path, self.path[1:], strict=False)
-        return np.stack([posts.watching(origin, entered) for origin, entered in bounds])
+        return np.stack([posts.watching(*bound) for bound in pairwise(self.path)])
 
     @cached_property
     def routes(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
@@ -186,6 +225,14 @@ class Plan(Summary):
         return tuple(map(posts.bound_routes, path, path[1:], onward))
 
 
+def in_draws(band: tuple[float, float] | None, sign: float = 1.0) -> str:
+    """Describe the 90 % band of a value times `sign`, after the value; empty without a band."""
+    if band is None:
+        return ""
+    low, high = sorted(sign * end for end in band)
+    return f", {low:z.3g} to {high:z.3g} in 90 % of the draws"
+
+
 def past_failures_of(plan: Plan) -> list[str]:
     """Describe the past failures of a plan, one text for each of its bounds.
 
@@ -195,52 +242,37 @@ def past_failures_of(plan: Plan) -> list[str]:
     if p_fail is None:
         return []
 
-    of_bounds: dict[int, list[PastFailure]] = {}
+    # Failures of the plan's own way come first, as None.
+    ways: dict[int, dict[Any, list[PastFailure]]] = {}
     for failure in plan.past_failures:
-        of_bounds.setdefault(failure.bound, []).append(failure)
+        k = failure.bound
+        same = failure.way[0] == plan.path[k - 1] and math.isclose(
+            failure.p_fail, p_fail[k - 1], rel_tol=_ROUNDING
+        )
+        way = None if same else (failure.way, failure.p_fail)
+        ways.setdefault(k, {None: []}).setdefault(way, []).append(failure)
 
     texts = []
-    for k, failures in of_bounds.items():
+    for k, of_bound in ways.items():
         left, entered = plan.path[k - 1 : k + 1]
-        p = float(p_fail[k - 1])
-        same = [
-            failure
-            for failure in failures
-            if failure.way[0] == left and math.isclose(failure.p_fail, p, rel_tol=_ROUNDING)
-        ]
-        text = (
-            f"bound {k} enters {path_text([entered])} from {path_text([left])} with failure "
-            f"probability {p:.2g}{_when(same)}"
-        )
-
-        others: dict[tuple[tuple[Cell, ...], float], list[PastFailure]] = {}
-        for failure in failures:
-            if failure not in same:
-                others.setdefault((failure.way, failure.p_fail), []).append(failure)
-        for (way, failed), which in others.items():
-            side = f"from {path_text(way[:1])}"
-            if way[0] == left:
-                side = "before another next move"
-            text += f"; {side}, it is {failed:.2g}{_when(which)}"
+        text = f"bound {k} enters {path_text([entered])} from {path_text([left])} with failure "
+        text += f"probability {p_fail[k - 1]:.2g}{_when(of_bound.pop(None))}"
+        for (way, failed), failures in of_bound.items():
+            side = "before another next move" if way[0] == left else f"from {path_text(way[:1])}"
+            text += f"; {side}, it is {failed:.2g}{_when(failures)}"
         texts.append(text)
     return texts
 
 
 def _when(failures: Sequence[PastFailure]) -> str:
     """Describe when failures happened, such as " (tipped in mission 3)"; empty without any."""
-    if not failures:
-        return ""
-    missions: dict[str, list[str]] = {}
-    for failure in failures:
-        numbers = missions.setdefault(failure.status, [])
-        if failure.mission is not None:
-            numbers.append(str(failure.mission))
-
     texts = []
-    for status, numbers in missions.items():
+    for status in dict.fromkeys(failure.status for failure in failures):
+        of_status = [failure.mission for failure in failures if failure.status == status]
+        numbers = [str(number) for number in of_status if number is not None]
         plural = "missions" if len(numbers) > 1 else "mission"
         texts.append(f"{status} in {plural} {joined(numbers)}" if numbers else status)
-    return f" ({', '.join(texts)})"
+    return f" ({', '.join(texts)})" if texts else ""
 
 
 def plan_to_record(plan: Plan) -> dict[str, Any]:
