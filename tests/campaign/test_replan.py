@@ -8,13 +8,12 @@ from enumeration import every_path, value_of
 from worlds import random_cells
 
 import trustbo as tb
-from trustbo.campaign.replan import is_replanned, trust_filter
+from trustbo.campaign.replan import trust_filter
 from trustbo.errors import TrustboError
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.models import PooledTrust
 from trustbo.planning import NoPathError, Planner
-from trustbo.report import failed_bounds_of, replanned_of
 from trustbo.workspace.moves import END, bounds_along, bounds_and_next
 
 ENDS = ((3, 0), (0, 3))
@@ -54,28 +53,29 @@ def test_the_table_and_the_report_name_the_bound_that_failed_before_replanning()
     row = campaign.table().loc[2]
     assert (row["status"], row["reason"], row["where"]) == ("ok", "stuck", "1,2")
     assert campaign.history["reason"].values.tolist() == ["", "stuck"]
-    assert failed_bounds_of(campaign) == ["", "2 into 1,2 (stuck)"]
-    assert replanned_of(campaign) == ["", "replanned"]
+    assert campaign.table()["failed_bounds"].tolist() == ["", "2 into 1,2 (stuck)"]
+    assert campaign.table()["replanned"].tolist() == [False, True]
 
     again = campaign.ask().path
     campaign.fail("tipped", where=again[1])
     campaign.exclude(2, "a bad day")
     assert campaign.table()["reason"].tolist() == ["", "a bad day", "tipped"]
     cell = ",".join(map(str, again[1]))
-    assert failed_bounds_of(campaign)[1:] == ["2 into 1,2 (stuck)", f"into {cell} (tipped)"]
-    assert replanned_of(campaign) == ["", "replanned", ""]
+    table = campaign.table()
+    assert table["failed_bounds"].tolist()[1:] == ["2 into 1,2 (stuck)", f"into {cell} (tipped)"]
+    assert table["replanned"].tolist() == [False, True, False]
 
 
 def test_a_mission_is_replanned_if_its_plan_contains_driven_or_blocked_bounds():
     campaign = begun()
-    assert not is_replanned(campaign.ask())
+    assert not campaign.ask().is_replanned
     assert campaign.ask().n_driven == 0
     plan = campaign.replan(PATH[1])
-    assert is_replanned(plan)
+    assert plan.is_replanned
     assert plan.n_driven == 1
 
     campaign = begun()
-    assert is_replanned(campaign.replan(PATH[0], blocked=[PATH[:2]]))
+    assert campaign.replan(PATH[0], blocked=[PATH[:2]]).is_replanned
 
 
 @pytest.mark.parametrize("objective", ["lost_contact", "terminal", "mean"])

@@ -42,11 +42,13 @@ _FIRST_COLUMNS = (
     "state",
     "reason",
     "where",
+    "failed_bounds",
     "contact_rate",
     "objective",
     "n_bounds",
     "n_unmeasured",
     "path_changed",
+    "replanned",
     "path",
 )
 """First columns of the table of missions."""
@@ -324,7 +326,7 @@ class Result(Summary):
         numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
         table = pd.DataFrame([self.state.row(j) for j in range(len(entries))], numbers)
 
-        history = table.drop(columns=["where", "n_bounds", "path"]).to_xarray()
+        history = table.drop(columns=["where", "failed_bounds", "n_bounds", "path"]).to_xarray()
         history["path"] = ("iteration", "step", "axis"), steps
         history["trust_map"] = xr.concat([entry.trust_map for entry in entries], numbers)
         history.attrs["objective"] = self.settings["objective"]
@@ -340,11 +342,13 @@ class Result(Summary):
         - `reason`: reason for the state or the failure; otherwise, the statuses of bounds that were
           not completed.
         - `where`: cells where a bound failed.
+        - `failed_bounds`: bounds that were not completed, such as "2 into 1,2 (stuck)".
         - `contact_rate`: mean contact rate.
         - `objective`: value of the objective for the plan.
         - `n_bounds`: number of bounds run.
         - `n_unmeasured`: number of bounds run in which no contact rate was measured.
         - `path_changed`: whether the plan differs from the previous one.
+        - `replanned`: whether bounds had been driven, or were blocked, when the plan was made.
         - `path`: planned path as text, such as "9,0 8,1".
         - `contact_lost`: contact lost, in bounds: the sum over bounds of 1 minus the mean contact
           rate of the measured robots. Bounds without any rate count as the mean of the mission's

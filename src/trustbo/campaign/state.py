@@ -49,13 +49,16 @@ class Failure(NamedTuple):
 
     def row(self) -> dict[str, Any]:
         """Return the failure's row in the table of missions."""
+        where = "" if self.where is None else path_text([self.where])
         return {
             "status": self.reason if self.path else "aborted",
             "state": GIVEN_UP,
             "reason": self.reason,
-            "where": "" if self.where is None else path_text([self.where]),
+            "where": where,
+            "failed_bounds": where and f"into {where} ({self.reason})",
             "n_bounds": np.nan if self.where is None else self.path.index(self.where, 1),
             "path_changed": False,
+            "replanned": False,
             "path": path_text(self.path),
         }
 
@@ -274,9 +277,9 @@ class State:
         """
         entry = self.entries[j]
         state, reason = self.status_of(j)
+        failed = incomplete_bounds(entry.mission)
         if not reason:
-            statuses = [status for _, _, status in incomplete_bounds(entry.mission)]
-            reason = ", ".join(dict.fromkeys(statuses))
+            reason = ", ".join(dict.fromkeys(status for _, _, status in failed))
 
         posterior = entry.posterior
         is_own = posterior is not None and posterior.after == j + 1
@@ -284,8 +287,12 @@ class State:
         return {
             **entry.measures,
             "path_changed": entry.plan.path != before.plan.path,
+            "replanned": entry.plan.is_replanned,
             "state": state,
             "reason": reason,
+            "failed_bounds": ", ".join(
+                f"{k} into {path_text([cell])} ({status})" for k, cell, status in failed
+            ),
             **(posterior.diagnostics if posterior and is_own else {}),
         }
 
