@@ -343,15 +343,15 @@ def test_the_report_has_one_definition_of_driven_bounds(result, page, tmp_path):
     for other in (result, with_plan(result, longer)):
         table = bounds_of(other)
         expected = [driven.count(bound) for bound in pairwise(other.plan.path)]
-        assert table["driven"].tolist() == expected
-        assert np.isfinite(table["measured"]).tolist() == [n > 0 for n in expected]
+        assert table["begun"].tolist() == [0, *expected]
+        assert np.isfinite(table["measured"]).tolist() == [False, *(n > 0 for n in expected)]
 
         facts = facts_of(other)
         text = facts["Uncertain"].partition(";")[0].partition(": ")[2]
         new = [k for k, n in enumerate(expected, start=1) if not n]
         assert [int(k) for k in re.findall(r"(\d+) into", text)] == new
 
-        weakest = int(np.argmin(table["contact"])) + 1
+        weakest = table["contact"].idxmin()
         assert re.match(r"bound (\d+)", facts["Weakest bound"])[1] == f"{weakest}"
         file = page if other is result else tmp_path / "report.html"
         if other is not result:
@@ -382,11 +382,11 @@ def test_the_report_shows_failed_bounds_and_the_measured_contact_of_the_weakest(
     assert "<td>2 into 0,2 (stuck)</td>" in html
 
     known = bounds_of(with_plan(campaign, path))
-    assert known["driven"].tolist() == [1, 1]
-    np.testing.assert_allclose(known["measured"], [0.8, 0.3])
+    assert known["begun"].tolist() == [0, 1, 1]
+    np.testing.assert_allclose(known["measured"], [np.nan, 0.8, 0.3])
 
     around = bounds_of(with_plan(campaign, [(2, 0), (2, 1), (1, 2), (0, 2)]))
-    assert around["driven"].tolist() == [0, 0, 0]  # (0, 2) was entered from (1, 1) only
+    assert around["begun"].tolist() == [0, 0, 0, 0]  # (0, 2) was entered from (1, 1) only
     assert around["measured"].isna().all()
 
 

@@ -219,8 +219,3 @@ def _contact_lost(problem: Problem, driven: Driven) -> float:
     expected = problem.likelihood.mean_rate(driven.trust, noise_sd)
     rates = np.where(np.isnan(driven.contact_rate), expected, driven.contact_rate)
     return float((1.0 - rates).mean(1).sum())
-
-
-def is_replanned(plan: Plan) -> bool:
-    """Return whether bounds had been driven, or were blocked, when a campaign made this plan."""
-    return plan.n_driven > 0 or bool(plan.blocked)
