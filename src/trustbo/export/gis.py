@@ -164,11 +164,9 @@ def _feature(plan: Plan, layer: str, places: np.ndarray, about: dict[str, Any]) 
     if crs is None:
         raise TrustboError(_NO_CRS)
 
-    xy = np.atleast_2d(places)
-    lon, lat = converted(crs, "EPSG:4326", *xy.T)
-
+    lon, lat = converted(crs, "EPSG:4326", *np.atleast_2d(places).T)
     shape = shapely.Point(lon[0], lat[0])
-    if np.ndim(places) == 2:
+    if places.ndim == 2:
         shape = cut_at_180(shapely.LineString(np.column_stack([np.unwrap(lon, period=360.0), lat])))
 
     # RFC 7946, 11.2: no needless digits; the eighth decimal is about a millimetre.

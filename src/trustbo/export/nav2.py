@@ -8,8 +8,9 @@ CRS. YAML files are written as JSON, which is valid YAML.
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -97,15 +98,18 @@ class Frame:
 
     def of_crs(self, xy: Any) -> np.ndarray:
         """Convert positions (..., 2) from CRS metres to this frame, in metres."""
-        c = math.cos(self.rotation)
-        s = math.sin(self.rotation)
-        return (_positions(xy) - self.origin) @ np.array([[c, -s], [s, c]])
+        return (_positions(xy) - self.origin) @ self._turn
 
     def to_crs(self, xy: Any) -> np.ndarray:
         """Convert positions (..., 2) in this frame to CRS coordinates, both in metres."""
+        return _positions(xy) @ self._turn.T + self.origin
+
+    @property
+    def _turn(self) -> np.ndarray:
+        """Matrix that turns row vectors from the axes of the CRS to those of the frame."""
         c = math.cos(self.rotation)
         s = math.sin(self.rotation)
-        return _positions(xy) @ np.array([[c, s], [-s, c]]) + self.origin
+        return np.array([[c, -s], [s, c]])
 
 
 def _positions(xy: Any) -> np.ndarray:
@@ -167,9 +171,17 @@ def write_nav2(
 
     # All contents are made before the first file is written, so that an error leaves no incomplete
     # set of files.
-    waypoints = _waypoints(plan, place, workspace)
+    waypoints = {} if plan.stops is None else _waypoints(plan, place)
     files = {folder / f"waypoints_{robot}.yaml": text for robot, text in waypoints.items()}
-    about = _about(place, workspace)
+    parent = "grid" if workspace.grid.crs is None else workspace.grid.crs_name
+    about = _yaml(
+        {
+            "frame": place.name,
+            "parent": parent,
+            "origin": [*place.origin],
+            "rotation": place.rotation,
+        }
+    )
 
     if isinstance(result, Result):
         cost = result.maps()["cost"]
@@ -182,32 +194,39 @@ def write_nav2(
         _require_same_frame(folder / "frame.yaml", about)
 
     files[folder / "frame.yaml"] = about
-    _write(files)
+    for path, content in files.items():
+        write_file(path, content, is_raster=path.suffix == _PICTURE)
 
 
-def _waypoints(plan: Plan, frame: Frame, workspace: Workspace) -> dict[str, bytes]:
-    """Return the content of each robot's file of waypoints; empty without a terrain."""
-    if plan.stops is None:
-        return {}
-    _require_file_names(workspace.team.names)
+def _waypoints(plan: Plan, frame: Frame) -> dict[str, bytes]:
+    """Return the content of each robot's file of waypoints."""
+    team = plan.workspace.team
+    _require_file_names(team.names)
 
     contents = {}
-    for robot in workspace.team.members:
-        poses = [_pose(frame.name, *pose) for pose in stops_of(plan, robot, frame).tolist()]
-        contents[robot] = json.dumps({"poses": poses}, indent=1).encode()
+    for robot in team.members:
+        poses = [
+            {
+                "header": {"frame_id": frame.name},
+                "pose": {
+                    "position": {"x": x, "y": y, "z": 0.0},
+                    "orientation": {
+                        "x": 0.0,
+                        "y": 0.0,
+                        "z": math.sin(turn / 2.0),
+                        "w": math.cos(turn / 2.0),
+                    },
+                },
+            }
+            for x, y, turn in stops_of(plan, robot, frame).tolist()
+        ]
+        contents[robot] = _yaml({"poses": poses}, indent=1)
     return contents
 
 
-def _about(frame: Frame, workspace: Workspace) -> bytes:
-    """Return the content of `frame.yaml`."""
-    parent = "grid" if workspace.grid.crs is None else workspace.grid.crs_name
-    about = {
-        "frame": frame.name,
-        "parent": parent,
-        "origin": [*frame.origin],
-        "rotation": frame.rotation,
-    }
-    return json.dumps(about).encode()
+def _yaml(content: dict[str, Any], **options: Any) -> bytes:
+    """Return the content of a YAML file."""
+    return json.dumps(content, **options).encode()
 
 
 def _require_same_frame(file: Path, content: bytes) -> None:
@@ -236,12 +255,6 @@ def _require_file_names(robots: Sequence[str]) -> None:
             )
 
 
-def _write(files: Mapping[Path, bytes]) -> None:
-    """Write the contents of files, in order."""
-    for path, content in files.items():
-        write_file(path, content, is_raster=path.suffix == _PICTURE)
-
-
 def _ros_map(
     target: Path, cost: xr.DataArray, workspace: Workspace, frame: Frame, pixel: float | None
 ) -> dict[Path, bytes]:
@@ -254,7 +267,7 @@ def _ros_map(
     about = {"image": picture.name, "mode": "raw", "resolution": side, "origin": [*corner, 0.0],
              "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.196}  # fmt: skip
 
-    return {picture: pixels, target: json.dumps(about).encode()}
+    return {picture: pixels, target: _yaml(about)}
 
 
 def occupancy(
@@ -286,7 +299,7 @@ def occupancy(
     side = float(f"{shorter / 10.0:.2g}") if pixel is None else require_positive("pixel", pixel)
 
     left, bottom, right, top = grid.bounds
-    corners = frame.of_crs([[x, y] for x in (left, right) for y in (bottom, top)])
+    corners = frame.of_crs([*product((left, right), (bottom, top))])
     corner = corners.min(0)
 
     # The quotient may be a whole number plus a rounding error.
@@ -311,7 +324,7 @@ def _require_near(frame: Frame, bounds: tuple[float, float, float, float]) -> No
     require_kind("frame", frame, Frame, "give an export.Frame, such as Frame((x, y), rotation)")
     x, y = frame.origin
     left, bottom, right, top = bounds
-    away = math.hypot(max(left - x, 0.0, x - right), max(bottom - y, 0.0, y - top))
+    away = math.dist(frame.origin, np.clip(frame.origin, (left, bottom), (right, top)))
 
     if away > _FARTHEST:
         raise TrustboError(
@@ -335,26 +348,17 @@ def stops_of(plan: Plan, robot: str, frame: Frame) -> np.ndarray:
     n = plan.n_driven
     lead = frame.of_crs(plan.stops[n:])
     if robot == LEAD:
+        places = lead
         steps = np.diff(lead, axis=0)
-        return _towards(lead, np.vstack([steps, steps[-1:]]))
-
-    i = plan.workspace.team.names.index(robot)
-    routes = [of_bound[i + 1] for of_bound in plan.routes[n:]]
-    if any(route is None for route in routes) or routes[-1] is None:
-        raise TrustboError(f"robot {robot!r} has no route in a bound; plan another path.")
-
-    places = frame.of_crs(np.vstack([plan.posts[n:, i], routes[-1][-1:]]))
-    return _towards(places, np.vstack([lead[1:], lead[-1:]]) - places)
-
-
-def _towards(places: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        steps = np.vstack([steps, steps[-1:]])
+    else:
+        i = plan.workspace.team.names.index(robot)
+        routes = [of_bound[i + 1] for of_bound in plan.routes[n:]]
+        if any(route is None for route in routes) or routes[-1] is None:
+            raise TrustboError(f"robot {robot!r} has no route in a bound; plan another path.")
+        places = frame.of_crs(np.vstack([plan.posts[n:, i], routes[-1][-1:]]))
+        steps = np.vstack([lead[1:], lead[-1:]]) - places
     return np.column_stack([places, np.arctan2(steps[:, 1], steps[:, 0])])
-
-
-def _pose(frame: str, x: float, y: float, turn: float) -> dict[str, Any]:
-    turned = {"x": 0.0, "y": 0.0, "z": math.sin(turn / 2.0), "w": math.cos(turn / 2.0)}
-    pose = {"position": {"x": x, "y": y, "z": 0.0}, "orientation": turned}
-    return {"header": {"frame_id": frame}, "pose": pose}
 
 
 def _graph(result: Result, frame: Frame) -> str:
@@ -378,36 +382,27 @@ def _graph(result: Result, frame: Frame) -> str:
     graph = result.planner.graph(mean_of(draws, result.workspace))
     place = workspace.grid.center if posts is None else posts.stop
     where = {cell: frame.of_crs(place(cell)).tolist() for cell in graph.nodes}
+    ids = {(row, col): row * cols + col for row, col in where}
 
     features = []
     for (row, col), xy in where.items():
-        about = {"id": row * cols + col, "frame": frame.name, "metadata": {"row": row, "col": col}}
+        about = {"id": ids[row, col], "frame": frame.name, "metadata": {"row": row, "col": col}}
         features.append(_feature("Point", xy, about))
 
     failure_cost = result.planner.problem.cost_of_failure
     for a, c, edge in graph.edges(data=True):
         move = MOVES.index((c[0] - a[0], c[1] - a[1]))
-        first, last = (row * cols + col for row, col in (a, c))
         p_fail = -math.expm1(-edge.get("risk", 0.0))
         cost = max(edge["lost"] + failure_cost * p_fail, _MIN_COST)
 
-        about = {"id": (1 + move) * n_cells + last, "startid": first, "endid": last, "cost": cost}
-        about |= {"overridable": True, "metadata": {"penalty": cost, "p_fail": p_fail}}
+        about = {"id": (1 + move) * n_cells + ids[c], "startid": ids[a], "endid": ids[c]}
+        about |= {"cost": cost, "overridable": True}
+        about |= {"metadata": {"penalty": cost, "p_fail": p_fail}}
         features.append(_feature("MultiLineString", [[where[a], where[c]]], about))
     return '{"type": "FeatureCollection", "features": [\n' + ",\n".join(features) + "\n]}\n"
 
 
 def _feature(kind: str, coordinates: list[Any], properties: dict[str, Any]) -> str:
+    """Return a GeoJSON feature; Nav2 reads numbers without a decimal point as integers."""
     geometry = {"type": kind, "coordinates": coordinates}
-    return _json({"type": "Feature", "properties": properties, "geometry": geometry})
-
-
-def _json(value: Any) -> str:
-    """Convert values to JSON; floats keep a decimal point, otherwise Nav2 reads integers."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)}: {_json(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_json, value)) + "]"
-    if isinstance(value, float):
-        return np.format_float_positional(value, trim="0")
-    return json.dumps(value)
+    return json.dumps({"type": "Feature", "properties": properties, "geometry": geometry})
