@@ -14,7 +14,6 @@ from scipy import stats
 
 from trustbo.errors import TrustboError
 from trustbo.inference import add_latent, by_rate, fit
-from trustbo.inference.by_rate import Predictors, one_step_ahead
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import (
     ContactRate,
@@ -26,6 +25,7 @@ from trustbo.models import (
     TrustParams,
 )
 from trustbo.models.families import FAMILIES
+from trustbo.statespace import kalman
 
 
 def of_missions(rates):
@@ -86,17 +86,39 @@ def test_predicted_rates_have_the_dense_conditional_moments():
     cov = root @ root.T
     mean = rng.standard_normal(4)
     y = mean + 1.5
-    n = 40_000
-    ahead = Predictors(np.tile(mean, (n, 1, 1)), cov[None, None], np.full((1, 1, 1), 0.3))
-    log_p, drawn = one_step_ahead(ahead, y[None], np.ones((1, 4)), FAMILIES["gaussian"], rng)
+    before = np.tile(mean, (3, 1, 1)), cov[None, None], np.full((1, 1, 1), 0.3)
+    ahead = kalman.one_step_ahead(*before, y[None], np.ones((1, 4)), FAMILIES["gaussian"])
+    in_pairs = kalman.one_step_ahead(*before, y[None], np.ones((1, 4)), FAMILIES["gaussian"], 2)
     whole = cov + 0.3**2 * np.eye(4)
     for k in range(4):
         gain = np.linalg.solve(whole[:k, :k], whole[:k, k]) if k else np.zeros(0)
         m = mean[k] + gain @ (y - mean)[:k]
         sd = np.sqrt(whole[k, k] - gain @ whole[:k, k])
-        assert drawn[:, 0, k].mean() == pytest.approx(m, abs=5.0 * sd / np.sqrt(n))
-        assert drawn[:, 0, k].std() == pytest.approx(sd, rel=5.0 / np.sqrt(2.0 * n))
-        np.testing.assert_allclose(log_p[:, 0, k], stats.norm.logpdf(y[k], m, sd), atol=1e-9)
+        np.testing.assert_allclose(ahead.mean[:, 0, k], m, atol=1e-9)
+        np.testing.assert_allclose(ahead.var[:, 0, k], sd**2 - 0.3**2, atol=1e-9)
+        np.testing.assert_allclose(ahead.log_p[:, 0, k], stats.norm.logpdf(y[k], m, sd), atol=1e-9)
+        np.testing.assert_allclose(in_pairs.log_p, ahead.log_p)
+    gain = np.linalg.solve(whole[:2, :2], whole[:2, 2:])
+    np.testing.assert_allclose(in_pairs.mean[:, 0, 2:], [mean[2:] + (y - mean)[:2] @ gain] * 3)
+    left = np.diagonal(cov[2:, 2:] - gain.T @ whole[:2, 2:])
+    np.testing.assert_allclose(in_pairs.var[:, 0, 2:], [left] * 3)
+    np.testing.assert_allclose(in_pairs.mean[:, 0, :2], [mean[:2]] * 3)
+
+
+def test_rates_of_the_first_bound_are_drawn_with_trust_and_noise():
+    missions = simulate_missions(3)
+    posterior = fit(missions, PooledTrust(), draws=500, progress=False, check=False)
+    rates = by_rate(posterior)
+    draws = {n: v.values[0] for n, v in posterior["posterior"].to_dataset().items()}
+    parameters = [draws[n] for n in ("beta0", "beta", "b", "delta_w", "delta_v")]
+    x0 = [posterior.attrs[name] for name in ("x0_mean", "x0_sd")]
+    dense = mission_of_params(TrustParams(*parameters, *x0), missions[0].awareness[:1])
+    sd = np.sqrt(np.diagonal(dense.rate_cov, axis1=1, axis2=2))
+    predicted = rates["posterior_predictive"]["contact_rate"]
+    first = ((predicted["mission"] == 0) & (predicted["bound"] == 1)).values
+    white = (predicted.values[0, :, first].T - dense.mean) / sd
+    assert abs(white.mean(0)).max() < 5.0 / np.sqrt(len(white))
+    assert abs(white.std(0) - 1.0).max() < 5.0 / np.sqrt(2.0 * len(white))
 
 
 @pytest.mark.parametrize(

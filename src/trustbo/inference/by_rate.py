@@ -42,21 +42,13 @@ _COPIED = ("prior",)
 """Groups that are copied unchanged."""
 
 
-class Predictors(NamedTuple):
-    """Normal distribution of the linear predictors of each block, for some draws."""
-
-    mean: np.ndarray  # (draw, block, row)
-    cov: np.ndarray  # (draw, block or 1, row, row)
-    sd: np.ndarray  # own noise of rates, (draw, block or 1, row or 1)
-
-
 class _Source(NamedTuple):
     """Everything that is needed to predict the rates of a posterior."""
 
     observations: Observations
     layout: Layout
     likelihood: Family
-    predictors: Iterator[Predictors]  # one item per chunk of draws
+    predictors: Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]  # one item per chunk of draws
     of_counts: bool  # whether log-likelihoods are of tick counts if every rate has one
 
 
@@ -185,7 +177,7 @@ def _of_class(posterior: xr.DataTree, model: Model | None, some: np.ndarray) -> 
     terms = [effect.design(observations) for effect in fitted.model.terms]
     design = layout.design(sparse.hstack(terms, format="csr"))
 
-    def predictors() -> Iterator[Predictors]:
+    def predictors() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         for where, theta in chunks(draws.theta):
             predictor = fitted.model.linear_predictor(theta, observations, layout)
             inputs = (design @ draws.c[where].T).T
@@ -209,7 +201,7 @@ def _of_function(posterior: xr.DataTree, model: FunctionModel, some: np.ndarray)
     if not layout.joint:
         label = np.tile(np.arange(shape[2]), shape[0])
 
-    def predictors() -> Iterator[Predictors]:
+    def predictors() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         for space, inputs, _ in forms:
             predictor = LinearPredictor.from_space(space, layout)
             n_draws = len(space.transition)
@@ -233,11 +225,14 @@ def _peeked[T](items: Iterator[T]) -> tuple[T, Iterator[T]]:
 
 def _given(
     predictor: LinearPredictor, inputs: np.ndarray, offset: np.ndarray | float, label: np.ndarray
-) -> Predictors:
-    """Return the distribution of the linear predictors given inputs (draw, block, input)."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the mean, covariance and noise of linear predictors; see `kalman.one_step_ahead`.
+
+    `inputs` have the shape (draw, block, input).
+    """
     response = each(predictor.response, label)
     mean = each(predictor.mean, label) + (response @ inputs[..., None])[..., 0] + offset
-    return Predictors(mean, each(predictor.covariance, label), each(predictor.noise_sd, label))
+    return mean, each(predictor.covariance, label), each(predictor.noise_sd, label)
 
 
 # --- predictions one step ahead ---
@@ -259,11 +254,13 @@ def _predicted(source: _Source, seed: int) -> tuple[np.ndarray, np.ndarray, bool
 
     log_p = []
     predicted = []
-    for some in source.predictors:
-        found = one_step_ahead(some, y, n_ticks, likelihood, rng)
-        of_rates, drawn = (source.layout.unstack(values)[:, is_measured] for values in found)
-        log_p.append(of_rates)
-        predicted.append(drawn)
+    for mean, cov, sd in source.predictors:
+        ahead = kalman.one_step_ahead(mean, cov, sd, y, n_ticks, likelihood)
+        f = ahead.mean + np.sqrt(ahead.var) * rng.standard_normal(mean.shape)
+        drawn = likelihood.sample(f, sd, n_ticks, rng)
+
+        log_p.append(source.layout.unstack(ahead.log_p)[:, is_measured])
+        predicted.append(source.layout.unstack(drawn)[:, is_measured])
 
     # Log likelihoods of tick counts are comparable between families; NaN where ticks are unknown.
     shift = likelihood.log_resolution(observations.contact_rate, observations.n_ticks)
@@ -272,46 +269,3 @@ def _predicted(source: _Source, seed: int) -> tuple[np.ndarray, np.ndarray, bool
     if of_ticks:
         joined = joined + shift[is_measured]
     return joined, np.concatenate(predicted), of_ticks
-
-
-def one_step_ahead(
-    predictors: Predictors,
-    y: np.ndarray,
-    n_ticks: np.ndarray,
-    likelihood: Family,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Predict the rate of each row from the earlier rows of its block.
-
-    The linear predictors f of a block are jointly normal, and are updated by `kalman.condition`.
-
-    Args:
-        predictors: Distribution of the linear predictors before any rate.
-        y: Rates (block, row); NaN where not measured.
-        n_ticks: Tick counts (block, row).
-        likelihood: Observation family.
-        rng: Random number generator.
-
-    Returns:
-        Log p(y_k | y_1..k-1), 0 where not measured, and draws of y_k given y_1..k-1; each of shape
-        (draw, block, row).
-    """
-    mean = predictors.mean
-    shape = mean.shape
-    cov = np.broadcast_to(predictors.cov, (*shape, shape[-1]))
-    sd = np.broadcast_to(predictors.sd, shape)
-    log_p = np.zeros(shape)
-    drawn = np.full(shape, np.nan)
-    for k in range(shape[-1]):
-        if np.isnan(y[:, k]).all():
-            continue
-
-        m = mean[..., k]
-        v = cov[..., k, k]
-        f = m + np.sqrt(v) * rng.standard_normal(m.shape)
-        drawn[..., k] = likelihood.sample(f, sd[..., k], n_ticks[:, k], rng)
-        mean, cov, log_p[..., k] = kalman.condition(
-            mean, cov, k, y[:, k], n_ticks[:, k], sd[..., k], likelihood
-        )
-
-    return log_p, drawn

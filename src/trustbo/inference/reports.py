@@ -1,26 +1,26 @@
 """Predictions of people's reports from a posterior of `HumanTrust`."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy.special import softmax
 
+from trustbo.arrays import evenly_spaced
 from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_choice, require_count, require_whole
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.draws import QUANTILES, as_fitted, is_of_people, read_posterior
 from trustbo.inference.latent import predictors
+from trustbo.models.families import Family
 from trustbo.models.model import TrustModel
 from trustbo.parallel import computing
 from trustbo.stacking import require_same_team
+from trustbo.statespace import kalman
 from trustbo.statespace.blocks import each
 from trustbo.streams import stream
 
-_ALIKE = 16
-"""Number of draws of a fitted person's trust per draw of the population parameters."""
-_JITTER = 1e-12
-"""Number added to the covariance of a person's trust."""
 _LEAST_MASS = 1e-300
 """Smallest probability of a report; its logarithm is finite."""
 _CLOSE = 1e-12
@@ -42,8 +42,9 @@ def predict_reports(
 ) -> xr.Dataset:
     """Predict each report of fitted or new people from the earlier reports of the same person.
 
-    The earlier reports determine the weights of draws of the person's start, level and gains.
-    Reports at the same bound are not used to predict each other.
+    The person's trust is filtered under each draw of the population parameters. Moments are matched
+    after each report (see `TrustFilter`), which is exact for reports strictly between 0 and 1 on
+    the unit scale. Reports at the same bound are not used to predict each other.
 
     Args:
         posterior: Posterior of `HumanTrust`.
@@ -51,7 +52,7 @@ def predict_reports(
         given: `"earlier"` to use the earlier reports of the person, or `"none"` to use no reports.
         fitted: Whether the posterior was fitted to the earlier reports of these persons. If so,
             these reports do not change the weights of the population parameters again.
-        n_draws: Maximum number of draws of a person's trust.
+        n_draws: Maximum number of draws of the population parameters.
         seed: Random seed.
         model: Model of the posterior; needed if the priors are custom.
 
@@ -90,123 +91,110 @@ def predict_reports(
             f"missions have {missions[0].features}; give missions with the same inputs as the "
             "posterior."
         )
-    ahead = Density(of_fit.model, of_fit.model.observations(missions))
 
-    # For a fitted person, earlier reports reweight only the copies of each draw among themselves.
-    copies = _ALIKE if fitted else 1
-    some = np.unique(np.linspace(0, len(draws.c) - 1, max(1, n_draws // copies)).astype(int))
-    draws = draws.at(np.repeat(some, copies))
-    alike = _ALIKE if fitted else len(some)
+    density = Density(of_fit.model, of_fit.model.observations(missions))
+    draws = draws.at(evenly_spaced(len(draws.c), n_draws))
+    ahead = _ahead(density, draws, given == "earlier")
+    log_weight = _log_weights(ahead.log_p)
+    if fitted or given == "none":
+        log_weight = np.zeros(log_weight.shape)
 
     levels = levels_of(posterior.attrs["scale"])
-    shape = ahead.observations.contact_rate.shape
-    out = {name: np.full(shape, np.nan) for name in ("mean", "log_score")}
-    out["quantile"] = np.full((*shape, len(QUANTILES)), np.nan)
-    if levels:
-        out["probability"] = np.full((*shape, levels), np.nan)
-    for j, mission in enumerate(missions):
+    sd = draws.theta["delta_v"][:, None, None]
+    found = []
+    for j in range(len(missions)):
+        person = Person(
+            weight=softmax(log_weight[:, j], axis=0),
+            mean=ahead.mean[:, j],
+            var=ahead.var[:, j],
+            sd=sd,
+            report=density.observations.contact_rate[j],
+            ticks=density.observations.n_ticks[j],
+        )
         rng = stream(seed, "reports", j)
-        person = _of_person(ahead, draws, j, given == "earlier", alike, rng)
-        for (k, i), weight, center, var in person:
-            if k < len(mission.bounds):
-                found = _prediction(ahead, (j, k, i), weight, center, var, draws, levels, rng)
-                for name, value in found.items():
-                    out[name][j, k, i] = value
+        found.append(_prediction(person, density.model.likelihood, levels, rng))
 
+    out = {name: np.stack([one[name] for one in found]) for name in found[0]}
+    lengths = [len(mission.bounds) for mission in missions]
+    for j, n_bounds in enumerate(lengths):
+        for values in out.values():
+            values[j, n_bounds:] = np.nan
     for name in ("mean", "quantile"):
         out[name] = _answer_of(out[name], levels)
-    report = _answer_of(ahead.observations.contact_rate, levels)
+    report = _answer_of(density.observations.contact_rate, levels)
     return _dataset(report, out, levels, missions[0].robots)
 
 
-def _of_person(
-    ahead: Density, draws: JointDraws, j: int, earlier: bool, alike: int, rng: np.random.Generator
-) -> Iterator[tuple[tuple[int, int], np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield (bound, robot), draw weights, and mean and variance of trust for each report.
+class Person(NamedTuple):
+    """Reports of a person, and the trust before each of them under each draw."""
 
-    The person's trust is drawn row by row given the reports so far. Each run of `alike` draws has
-    the same total weight.
+    weight: np.ndarray  # of each draw, (draw, bound, 1)
+    mean: np.ndarray  # of trust, (draw, bound, robot)
+    var: np.ndarray  # of trust, (draw, bound, robot)
+    sd: np.ndarray  # of a report given trust, (draw, 1, 1)
+    report: np.ndarray  # (bound, robot), NaN where there is none
+    ticks: np.ndarray  # (bound, robot)
+
+
+def _ahead(density: Density, draws: JointDraws, earlier: bool) -> kalman.Ahead:
+    """Predict trust (draw, mission, bound, robot) from the earlier reports of each person."""
+    observations = density.observations
+    layout = density.layout
+    y = layout.rows(observations.contact_rate)
+    if not earlier:
+        y = np.full(y.shape, np.nan)
+    ticks = layout.rows(observations.n_ticks)
+
+    parts = []
+    for where, _, predictor, mean in predictors(density, draws):
+        cov = each(predictor.covariance, density.blocks.label)
+        sd = draws.theta["delta_v"][where, None, None]
+        parts.append(
+            kalman.one_step_ahead(
+                mean, cov, sd, y, ticks, density.model.likelihood, observations.n_robots
+            )
+        )
+    joined = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return kalman.Ahead(*(layout.unstack(values) for values in joined))
+
+
+def _log_weights(log_p: np.ndarray) -> np.ndarray:
+    """Return the log weights (draw, mission, bound, 1) of draws given the reports before a bound.
+
+    `log_p` (draw, mission, bound, robot) are the log masses of the reports.
     """
-    observations = ahead.observations
-    likelihood = ahead.model.likelihood
-    sd = draws.theta["delta_v"]
-    _, n_bounds, n_robots = observations.contact_rate.shape
-    y = observations.contact_rate[j].ravel()
-    ticks = observations.n_ticks[j].ravel()
-
-    # Trust of the person in each draw is normal, with this mean and root of the covariance.
-    means = []
-    roots = []
-    for _, _, predictor, of_all in predictors(ahead, draws):
-        means.append(of_all[:, j])
-        cov = each(predictor.covariance, ahead.blocks.label)
-        cov = np.broadcast_to(cov, (len(of_all), *cov.shape[1:]))[:, j % cov.shape[1]]
-        roots.append(np.linalg.cholesky(cov + _JITTER * np.eye(cov.shape[-1])))
-    mean = np.concatenate(means)
-    root = np.concatenate(roots)
-
-    white = np.zeros(mean.shape)
-    log_weight = np.zeros(len(mean))
-    for k in range(n_bounds):
-        runs = log_weight.reshape(-1, alike)
-        weight = np.exp(runs - np.logaddexp.reduce(runs, axis=1, keepdims=True)).ravel()
-        known = k * n_robots if earlier else 0  # rows of the reports that may be used
-        for i in range(n_robots):
-            r = k * n_robots + i
-            center = mean[:, r] + (root[:, r, :known] * white[:, :known]).sum(1)
-            var = (root[:, r, known : r + 1] ** 2).sum(1)
-            yield (k, i), weight / len(runs), center, var
-
-            # Draw trust given all reports so far, including reports at the same bound.
-            a = mean[:, r] + (root[:, r, :r] * white[:, :r]).sum(1)
-            d = root[:, r, r]
-            white[:, r] = rng.standard_normal(len(mean))
-            if earlier and not np.isnan(y[r]):
-                f, log_mass = likelihood.draw(y[r], ticks[r], a, d**2, sd, rng)
-                white[:, r] = (f - a) / d
-                log_weight = log_weight + log_mass
+    of_bound = log_p.sum(-1, keepdims=True)
+    return of_bound.cumsum(2) - of_bound
 
 
 def _prediction(
-    ahead: Density,
-    slot: tuple[int, int, int],
-    weight: np.ndarray,
-    center: np.ndarray,
-    var: np.ndarray,
-    draws: JointDraws,
-    levels: int,
-    rng: np.random.Generator,
-) -> dict[str, Any]:
-    """Predict a report given trust ~ N(center, var) in each draw, with weights (draw,)."""
-    likelihood = ahead.model.likelihood
-    sd = draws.theta["delta_v"]
-    y = ahead.observations.contact_rate[slot]
-    ticks = ahead.observations.n_ticks[slot]
+    person: Person, likelihood: Family, levels: int, rng: np.random.Generator
+) -> dict[str, np.ndarray]:
+    """Predict the reports of a person; return arrays (bound, robot, ...) by name."""
 
-    found: dict[str, Any] = {}
-    if not np.isnan(y):
-        log_mass, _, _ = likelihood.moment_match(y, ticks, center, var, sd)
-        found["log_score"] = np.log(max(weight @ np.exp(log_mass), _LEAST_MASS))
+    def probability(report: np.ndarray | float) -> np.ndarray:
+        log_mass, _, _ = likelihood.moment_match(
+            report, person.ticks, person.mean, person.var, person.sd
+        )
+        return (person.weight * np.exp(log_mass)).sum(0)
+
+    of_report = np.log(np.maximum(probability(person.report), _LEAST_MASS))
+    found = {"log_score": np.where(np.isnan(person.report), np.nan, of_report)}
 
     if levels:  # the probability of each answer is known
         answers = np.arange(levels) / (levels - 1.0)
-        log_masses = [
-            likelihood.moment_match(answer, ticks, center, var, sd)[0] for answer in answers
-        ]
-        mass = weight @ np.exp(np.stack(log_masses, axis=1))
-        mass = np.maximum(mass, _LEAST_MASS) / mass.sum()
-        which = np.searchsorted(np.cumsum(mass) - _CLOSE, QUANTILES)
-        quantile = answers[np.minimum(which, levels - 1)]
-        return found | {"mean": mass @ answers, "quantile": quantile, "probability": mass}
+        mass = np.stack([probability(answer) for answer in answers], axis=-1)
+        mass = np.maximum(mass, _LEAST_MASS) / mass.sum(-1, keepdims=True)
+        below = mass.cumsum(-1)[..., None, :] < np.array(QUANTILES)[:, None] - _CLOSE
+        which = np.minimum(below.sum(-1), levels - 1)
+        return found | {"mean": mass @ answers, "quantile": answers[which], "probability": mass}
 
     # Otherwise, draw a report from each draw of trust, for weighted quantiles.
-    trust = center + np.sqrt(var) * rng.standard_normal(len(var))
-    drawn = likelihood.sample(trust, sd, ticks, rng)
-
-    order = np.argsort(drawn)
-    which = np.searchsorted(np.cumsum(weight[order]), QUANTILES)
-    quantile = drawn[order][np.minimum(which, len(drawn) - 1)]
-    return found | {"mean": weight @ drawn, "quantile": quantile}
+    trust = person.mean + np.sqrt(person.var) * rng.standard_normal(person.mean.shape)
+    drawn = likelihood.sample(trust, person.sd, person.ticks, rng)
+    weight = np.broadcast_to(person.weight, drawn.shape)
+    quantile = np.quantile(drawn, QUANTILES, axis=0, weights=weight, method="inverted_cdf")
+    return found | {"mean": (weight * drawn).sum(0), "quantile": np.moveaxis(quantile, 0, -1)}
 
 
 def _dataset(

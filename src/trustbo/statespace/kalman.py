@@ -137,6 +137,57 @@ def condition(
     return mean, cov, log_mass
 
 
+class Ahead(NamedTuple):
+    """Predictions of rates from the earlier rates of their block, each (draw, block, row)."""
+
+    mean: np.ndarray
+    """Mean of the linear predictor."""
+    var: np.ndarray
+    """Variance of the linear predictor."""
+    log_p: np.ndarray
+    """Log density of the rate given all rates of earlier rows; 0 where it was not measured."""
+
+
+def one_step_ahead(
+    mean: np.ndarray,
+    cov: np.ndarray,
+    sd: np.ndarray,
+    y: np.ndarray,
+    n_ticks: np.ndarray,
+    likelihood: MomentMatching,
+    n_at_once: int = 1,
+) -> Ahead:
+    """Predict the rate of each row of joint normals from the rates of earlier rows.
+
+    Args:
+        mean: Means of the linear predictors before any rate, shape (draw, block, row).
+        cov: Their covariances, shape (draw, block or 1, row, row).
+        sd: Standard deviation of each rate's own noise, shape (draw, block or 1, row or 1).
+        y: Rates (block, row); NaN where not measured.
+        n_ticks: Tick counts (block, row).
+        likelihood: Observation family.
+        n_at_once: Number of rows of one bound, whose mean and variance do not depend on the rates
+            of the same bound.
+    """
+    shape = mean.shape
+    n_rows = shape[-1]
+    cov = np.broadcast_to(cov, (*shape, n_rows))
+    sd = np.broadcast_to(sd, shape)
+    ahead = Ahead(np.zeros(shape), np.zeros(shape), np.zeros(shape))
+    for k in range(n_rows):
+        if k % n_at_once == 0:
+            of_bound = slice(k, k + n_at_once)
+            ahead.mean[..., of_bound] = mean[..., of_bound]
+            ahead.var[..., of_bound] = np.diagonal(cov, axis1=-2, axis2=-1)[..., of_bound]
+
+        if not np.isnan(y[:, k]).all():
+            mean, cov, ahead.log_p[..., k] = condition(
+                mean, cov, k, y[:, k], n_ticks[:, k], sd[..., k], likelihood
+            )
+
+    return ahead
+
+
 def marginal_log_densities(
     space: StateSpace, predicted: Belief, y: np.ndarray, n_ticks: np.ndarray, likelihood: Likelihood
 ) -> np.ndarray:
