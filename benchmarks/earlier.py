@@ -77,10 +77,10 @@ class Restless:
 
 def without_places(result: Any) -> Any:
     """Return a result as if its missions were on another map."""
-    entries = [
+    entries = tuple(
         replace(entry, mission=replace(entry.mission, map="elsewhere"))
         for entry in result.state.entries
-    ]
+    )
     state = replace(result.state, entries=entries)
     return tb.campaign.Result(result.workspace, state, result.learner, result._base)
 

@@ -49,17 +49,15 @@ def to_path(path: FilePath) -> Path:
         raise TrustboError(f"{text!r:.60}: the home folder of '~' is unknown.") from None
 
 
-def write_file(
-    path: FilePath, content: bytes, *, make_folder: bool = True, is_raster: bool = False
-) -> None:
+def write_file(path: FilePath, content: bytes, *, is_raster: bool = False) -> None:
     """Write a whole file or nothing.
 
     The content is made in memory first: libraries that write to a path may hide that a disk is
     full.
 
-    The file is written under an unused temporary name in the same folder, flushed to disk and
-    renamed. If anything fails, the temporary file is removed and an existing file is unchanged. A
-    link is followed, and an existing file keeps its permissions.
+    The file is written under an unused temporary name in its folder, which is created if it does
+    not exist, flushed to disk and renamed. If anything fails, the temporary file is removed and an
+    existing file is unchanged. A link is followed, and an existing file keeps its permissions.
 
     Side files of a raster go before the new raster comes: if writing stops in between, the old
     raster without its statistics is left, not the new one with those of the old one.
@@ -67,7 +65,6 @@ def write_file(
     Args:
         path: File to write; `~` is the home folder.
         content: Content of the file.
-        make_folder: Whether to create the folder if it does not exist.
         is_raster: Whether the file is a raster, whose old side files are removed, as GDAL does.
 
     Raises:
@@ -78,8 +75,7 @@ def write_file(
         target = Path(os.path.realpath(given))
         if target.exists() and not target.is_file():
             raise TrustboError(f"cannot write {str(given)!r}: it is not a file.")
-        if make_folder:
-            target.parent.mkdir(parents=True, exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         rasters = {given, target} if is_raster else set()  # GIS look beside a link, too
         side_files = [Path(f"{raster}{ending}") for raster in rasters for ending in _SIDE_FILES]
         _replace(target, content, side_files)

@@ -224,7 +224,7 @@ def test_tell_that_fails_at_the_mission_or_at_the_record_is_recorded_or_not(
 ):
     """The first write, and one of the last ones, of the test above."""
     outcomes = []
-    for n in (2, 12):
+    for n in (2, 14):
         folder = shutil.copytree(template, tmp_path / str(n) / "campaign")
         outcomes.append(check(folder, "tell", mission, expected, Failing(n, fault)))
     assert outcomes == (["refused", "done"] if fault == "full" else ["interrupted"] * 2)

@@ -151,7 +151,7 @@ class FolderStorage:
                     _set_aside(self.path / name)
                 new[name] = _write(self.path, name, content)
             record = record_to_bytes(state, self.files | new)
-            write_file(self.path / RECORD, record, make_folder=False)
+            write_file(self.path / RECORD, record)
         except BaseException:
             if _version_of(self.path / RECORD) == self._written:
                 for name in new:
@@ -190,14 +190,8 @@ class MemoryStorage:
 
 
 def _write(folder: Path, name: str, content: bytes) -> str:
-    """Write a file, given its path in a folder, which is not created; returns its hash."""
-    file = folder / name
-    try:
-        file.parent.mkdir(exist_ok=True)
-    except OSError as error:
-        raise TrustboError(f"cannot create {str(file.parent)!r}: {error.strerror}.") from error
-
-    write_file(file, content, make_folder=False)
+    """Write a file, given its path in a folder, and return its hash."""
+    write_file(folder / name, content)
     return hash_of(content)
 
 
@@ -293,7 +287,7 @@ def _write_campaign(folder: Path, workspace: Workspace, state: State) -> dict[st
                     "move it, or give another folder."
                 )
             files[name] = _write(beside, name, content)
-        write_file(beside / RECORD, record_to_bytes(state, files), make_folder=False)
+        write_file(beside / RECORD, record_to_bytes(state, files))
 
         with holding_interrupts():
             put_in_place(folder, beside)

@@ -9,8 +9,8 @@ continues. Only files that the old campaign lists are deleted.
 
 import os
 import re
-import secrets
 import shutil
+import tempfile
 from pathlib import Path
 
 from trustbo.campaign.record import MISSIONS, POSTERIORS, RECORD, mission_file, read_record
@@ -62,12 +62,10 @@ def recorded_files(folder: Path) -> dict[str, str]:
 
 def new_folder(folder: Path) -> Path:
     """Create an empty folder for a new campaign inside the folder of the old one."""
-    path = folder / f"{_NEW}{secrets.token_hex(4)}"
     try:
-        path.mkdir()
+        return Path(tempfile.mkdtemp(prefix=_NEW, dir=folder))
     except OSError as error:
-        raise TrustboError(f"cannot create {str(path)!r}: {error.strerror}.") from error
-    return path
+        raise TrustboError(f"cannot write in {str(folder)!r}: {error.strerror}.") from error
 
 
 def put_in_place(folder: Path, new: Path) -> None:
