@@ -355,6 +355,7 @@ def _by_number(what: str, dim: str, labels: np.ndarray, *, in_order: bool = Fals
     )
     if counts or not len(labels) or (dim == "bound" and _are_times(labels)):
         return order
+
     starts = " or ".join(str(first) for first in _FIRST[dim])
     raise TrustboError(
         f"{what} has the {dim} labels {one_line(labels.tolist())}; they must be the numbers from "

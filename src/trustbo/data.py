@@ -185,6 +185,7 @@ class Mission(Summary):
         """Check and copy the arrays; a message names the first bound whose values are wrong."""
         given = [getattr(self, name) for name in MEASURED]
         _require_axes(*given)
+
         mapped = len(self.path) > 0
         try:
             checked = _checked("the bounds", mapped, *given)
@@ -200,10 +201,12 @@ class Mission(Summary):
         unknown = (None,) * n_bounds
         poses = self.poses or unknown
         contact = self.contact or unknown
+
         for k, of_bound in enumerate(
             zip(poses, contact, self.starts, self.bound_status, strict=True)
         ):
             _require_recorded(self._name_of(k), n_robots, *of_bound[:2])
+
         return {
             "starts": tuple(require_finite("starts of bounds", t0) for t0 in self.starts),
             "poses": tuple(_own(values, float) for values in poses),
@@ -219,13 +222,15 @@ class Mission(Summary):
                 f"{n_run} bounds need a path of at least {n_run + 1} cells; got {len(self.path)}. "
                 "Give None for a log without a map."
             )
+
         last = self.bound_status[-1]
         if self.status == "ok" and (n_run < n_planned or last != "ok"):
+            of_planned = f" of {n_planned}" if self.path else ""
             raise TrustboError(
-                'status "ok" means that the goal was reached, but the mission has run '
-                f"{n_run} of {n_planned} bounds, and the last one has the status {last!r}; give "
-                "the status of the mission."
+                f'status "ok" means that the goal was reached, but {n_run}{of_planned} bounds were '
+                f"run, and the last one has the status {last!r}; give the status of the mission."
             )
+
         if min(map(min, self.path), default=0) < 0:  # would be read from the other end
             raise TrustboError(
                 f"rows and columns are counted from 0, but the path is {self.path}; give path=None "
@@ -298,6 +303,7 @@ class Mission(Summary):
         names = {"robot": as_names("robots", robots), "feature": as_names("features", features)}
         z = read_labelled("awareness", awareness, _DIMS, names)
         names |= z.coords
+
         y = read_labelled("contact_rate", contact_rate, _DIMS[:2], names)
         names |= y.coords
         _require_axes(z.values, y.values)
@@ -395,6 +401,7 @@ class Mission(Summary):
             values = getattr(self, name)
             fill = unknown if name == "awareness" else np.nan
             margin = [(0, 0), (0, 1), (0, 1)][: values.ndim]
+
             wider = np.pad(values, margin, constant_values=fill)[:, i]
             changes[name] = wider[..., m] if name == "awareness" else wider
 
@@ -426,6 +433,7 @@ class Mission(Summary):
         """Bounds that were run, whose arrays are views of those of the mission."""
         cells = self.driven[1:] or (NOWHERE,) * len(self.contact_rate)
         columns = (getattr(self, name) for name in _COLUMNS)
+
         return tuple(Bound(*values) for values in zip(cells, *columns, strict=True))
 
 

@@ -232,7 +232,7 @@ def _tables(result: Result) -> dict[str, str]:
         missions = missions.rename(columns={"objective": "predicted_lost"})
     missions.columns = missions.columns.str.replace("_", " ")
 
-    last = result.state.entries[-1].row
+    last = result.state.row(len(result.state.entries) - 1)
     diagnostics = {
         name: last[column]
         for column, name in _DIAGNOSTICS.items()

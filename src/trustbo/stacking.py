@@ -26,6 +26,7 @@ def prepare(
     earlier = list_of_missions(earlier, "earlier")
     filled, known = fill(missions, workspace)
     own = [filled[j] for j in known]
+
     if not earlier:
         return require_same_team(own), own[0].robots
 
@@ -48,6 +49,7 @@ def fill(
     """
     missions = list_of_missions(missions)
     indices = list(range(len(missions)))
+
     if workspace is None:
         return missions, indices
 
@@ -64,6 +66,7 @@ def padded(arrays: Sequence[np.ndarray], fill: float) -> np.ndarray:
     n_bounds = max(len(values) for values in arrays)
     shape = (len(arrays), n_bounds, *arrays[0].shape[1:])
     whole = np.full(shape, fill, dtype=arrays[0].dtype)
+
     for values, of_mission in zip(arrays, whole, strict=True):
         of_mission[: len(values)] = values
     return whole

@@ -105,23 +105,19 @@ def missions_to_tree(missions: Iterable[Mission]) -> xr.DataTree:
 
     # Ticks of the bounds that have both poses and contact.
     n_robots = len(names["robot"])
-    recorded = []
-    poses = [np.empty((0, 1 + n_robots, 3))]
-    contacts = [np.empty((0, n_robots), dtype=bool)]
-    for bound in bounds:
-        if bound.poses is None or bound.contact is None:
-            recorded.append(0)
-        else:
-            recorded.append(len(bound.poses))
-            poses.append(bound.poses)
-            contacts.append(bound.contact)
+    none = np.empty((0, 1 + n_robots, 3)), np.empty((0, n_robots), dtype=bool)
+    ticks = [(bound.poses, bound.contact) for bound in bounds]
+    ticks = [
+        none if poses is None or contact is None else (poses, contact) for poses, contact in ticks
+    ]
+    poses, contacts = zip(*ticks, strict=True)
 
     cells = [cell for mission in missions for cell in mission.path]
     variables: dict[str, Any] = {
         "path": (("step", "axis"), np.reshape(cells, (-1, 2)).astype(int)),
         "start": ("bound", [bound.t0 for bound in bounds], {"units": "s"}),
         "bound_status": ("bound", [bound.status for bound in bounds]),
-        "recorded": ("bound", recorded),
+        "recorded": ("bound", [len(of_bound) for of_bound in poses]),
         "pose": (("tick", "member", "component"), np.concatenate(poses)),
         "contact": (("tick", "robot"), np.concatenate(contacts)),
         "n_bounds": ("mission", [len(mission.bounds) for mission in missions]),
