@@ -188,13 +188,13 @@ def test_parameters_of_a_posterior_are_put_in_the_order_of_a_workspace(truth, wo
 
 
 def test_labelled_fields_of_parameters_are_read_by_name(truth, workspace):
-    one = truth.draw(0).replace(features=None)
+    one = truth.draw(0)
     labels = {"robot": list(workspace.team.names), "feature": list(workspace.features)}
     beta = xr.DataArray(one.beta, labels, ("draw", "robot", "feature"))
     turned = one.replace(beta=beta.isel(robot=[2, 0, 1], feature=[1, 0]).transpose())
     planner = tb.Planner(workspace, PATH[0], PATH[-1])
     assert planner.plan(turned).value == planner.plan(one).value
     with pytest.raises(TrustboError, match="beta"):
-        one.replace(robots=None, beta=beta)  # the others have no names, so their order is unknown
+        one.replace(robots=None, beta=beta)  # the order of arrays without names is unknown
     with pytest.raises(TrustboError, match="slope"):
-        planner.plan(one.replace(beta=beta.assign_coords(feature=["slope", "canopy"])))
+        one.replace(beta=beta.assign_coords(feature=["slope", "canopy"]))

@@ -107,7 +107,7 @@ def test_any_model_has_any_effects_and_is_read_back_as_it_was(name):
             np.testing.assert_allclose(values, kept.reshape(values.shape), rtol=1e-9, atol=1e-12)
     params = params_of(posterior)
     assert params.n_draws == 400
-    assert bool(params.linear.places) == ("places" in posterior.children)
+    assert ("place" in params.arrays) == ("places" in posterior.children)
     assert np.isfinite(posterior["log_likelihood"]["contact_rate"]).all()
 
 
@@ -116,7 +116,7 @@ def test_effects_are_in_the_plans_of_the_next_mission():
     posterior = fit(missions, MODELS["places and robots"], **QUIET)
     params = params_of(posterior)
     assert params.n_robots == len(missions[0].robots)
-    assert params.linear.places
+    assert "place" in params.arrays
 
 
 def test_effects_of_places_are_stored_in_a_thousand_draws_of_single_precision():

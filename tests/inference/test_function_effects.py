@@ -185,9 +185,9 @@ def test_draws_for_planning_contain_the_effects(campaign, missions, workspace):
     places = fitted["places"].to_dataset().squeeze("chain")
     at = (places["cell_row"] == cell[0]) & (places["cell_col"] == cell[1])
     s = places["place"].isel(cell=int(np.argmax(at.values))).values
-    np.testing.assert_allclose(drawn.effects.place[:, 0, *cell], s, atol=1e-8)
+    np.testing.assert_allclose(drawn.arrays["place"][:, 0, *cell], s, atol=1e-8)
     np.testing.assert_allclose(
-        drawn.draw(3).inputs(awareness), inputs[3], rtol=1e-12, equal_nan=True
+        drawn.draw(3).inputs(awareness)[0], inputs[3], rtol=1e-12, equal_nan=True
     )
 
     # A bound that is given alone has the same input as on the map.
@@ -198,7 +198,7 @@ def test_draws_for_planning_contain_the_effects(campaign, missions, workspace):
 
     expected = tb.inference.params_of(fitted, workspace)
     np.testing.assert_allclose(
-        expected.mean().inputs(awareness), expected.inputs(awareness).mean(0), rtol=1e-7
+        expected.mean().inputs(awareness)[0], expected.inputs(awareness).mean(0), rtol=1e-7
     )
     plan = tb.Planner(workspace, (4, 0), (0, 4)).plan(drawn)
     assert plan.path[-1] == (0, 4)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -14,6 +14,21 @@ from trustbo.models.robots_in_bounds import RobotsInBounds
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.statespace.form import coupled_robots, independent_robots
 
+PLACES = {
+    "place": ("effect", "row", "col"),
+    "place_bound": ("effect", "move", "row", "col"),
+}
+"""Axes of the effects of places; the first has one entry, or one for each robot."""
+_AXES = {
+    **dict.fromkeys(("beta0", "b", "delta_w", "delta_v"), ("robot",)),
+    **dict.fromkeys(("B0", "Delta_w", "Delta_v"), ("robot", "robot")),
+    "beta": ("robot", "feature"),
+    "B": ("feature", "robot", "robot"),
+    **PLACES,
+}
+"""Last axes of the parameters, of which those that all robots share lack the first one."""
+_OF_INPUTS = ("beta", "B", "b", *PLACES)
+"""Parameters that are not part of the equation."""
 _MOST_SHOWN = 6
 """Largest number of values that a summary shows; longer parameters are shown as a range."""
 
@@ -21,31 +36,16 @@ Order = Mapping[str, Sequence[str]]
 """Names of robots and features in order, with the keys `robot` and `feature`."""
 
 
-class Drift(Protocol):
-    """One term of the input of bounds under each draw."""
+class OwnDrift(Protocol):
+    """Drift that is not linear in awareness, such as that of a NumPyro function."""
 
     @property
-    def is_shared(self) -> bool:
-        """Whether all robots have the same weights."""
+    def shape(self) -> tuple[int, int] | None:
+        """Shape (row, col) of the map on whose cells the drift depends; None if on no cell."""
         ...
 
     @property
-    def n_robots(self) -> int | None:
-        """Number of robots; None if the term applies to any number of them."""
-        ...
-
-    @property
-    def n_features(self) -> int:
-        """Number of features."""
-        ...
-
-    @property
-    def grid_shape(self) -> tuple[int, int] | None:
-        """Shape (row, col) of the map on whose cells the term depends; None if on no cell."""
-        ...
-
-    @property
-    def values(self) -> dict[str, np.ndarray]:
+    def values(self) -> Mapping[str, np.ndarray]:
         """Parameters (draw, ...) by name."""
         ...
 
@@ -61,137 +61,9 @@ class Drift(Protocol):
         """Average over draws; the axis (draw,) of the result has length 1."""
         ...
 
-    def in_order(self, own: Order, wanted: Order) -> Self:
-        """Return the term for the robots and features `own` in the order `wanted`."""
+    def require_order(self, own: Order, wanted: Order) -> None:
+        """Raise TrustboError unless the drift is that of robots and features in this order."""
         ...
-
-
-class LinearDrift(NamedTuple):
-    """Input u = sum_m beta_m z_m + b, with any effects of places.
-
-    Attributes:
-        weights: Feature weights of all robots (draw, feature), of each robot (draw, robot, feature)
-            or of each pair of robots (draw, feature, robot, robot').
-        b: Intercept, shape (draw,) or (draw, robot).
-        place: Effects of entered cells, shape (draw, effect, row, col), or None.
-        place_bound: Effects of bounds, shape (draw, effect, move, row, col), or None.
-        place_robot: Effects of robots in bounds, or None.
-    """
-
-    weights: np.ndarray
-    b: np.ndarray
-    place: np.ndarray | None = None
-    place_bound: np.ndarray | None = None
-    place_robot: RobotsInBounds | None = None
-
-    @property
-    def is_shared(self) -> bool:
-        """See `Drift.is_shared`."""
-        return self.weights.ndim == 2
-
-    @property
-    def n_robots(self) -> int | None:
-        """See `Drift.n_robots`."""
-        if self.b.ndim > 1:
-            return self.b.shape[1]
-        if self.place_robot is not None:
-            return self.place_robot.known.shape[1]
-        n = max((effect.shape[1] for effect in self.places.values()), default=1)
-        return n if n > 1 else None
-
-    @property
-    def n_features(self) -> int:
-        """See `Drift.n_features`."""
-        return self.weights.shape[1 if self.weights.ndim == 4 else -1]
-
-    @property
-    def places(self) -> dict[str, np.ndarray]:
-        """Effects of places that are the same in all missions, by name."""
-        effects = {"place": self.place, "place_bound": self.place_bound}
-        return {name: effect for name, effect in effects.items() if effect is not None}
-
-    @property
-    def grid_shape(self) -> tuple[int, int] | None:
-        """See `Drift.grid_shape`."""
-        for effect in self.places.values():
-            return effect.shape[-2:]
-        return None
-
-    @property
-    def values(self) -> dict[str, np.ndarray]:
-        """See `Drift.values`; effects of robots in bounds are left out."""
-        name = "B" if self.weights.ndim == 4 else "beta"
-        return {name: self.weights, "b": self.b, **self.places}
-
-    def inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
-        """See `Draws.inputs`."""
-        flat = awareness.reshape(len(awareness), -1, awareness.shape[-1])
-        if self.weights.ndim == 2:
-            u = np.tensordot(self.weights, flat, (-1, -1))
-        elif self.weights.ndim == 3:
-            u = np.einsum("...im,...ikm->...ik", self.weights, flat)
-        else:
-            u = np.einsum("...mai,...ikm->...ak", self.weights, flat)
-        u += self.b.reshape(len(self.b), -1, 1)  # in place, because the array may be large
-
-        if bounds is not None:
-            return u + self._of_places(bounds) if self.places else u
-
-        u = u.reshape(*u.shape[:2], *awareness.shape[1:-1])
-        if self.place is not None:  # the effect of a cell is the same for all moves that enter it
-            u = u + self.place[:, :, None]
-        if self.place_bound is not None:
-            u = u + self.place_bound
-        return u if self.place_robot is None else u + self.place_robot.everywhere()
-
-    def _of_places(self, bounds: np.ndarray) -> np.ndarray:
-        """Return the effects (draw, effect, bound) of places; effects of the move -1 are 0."""
-        moves, rows, cols = np.asarray(bounds).T
-        total: Any = 0.0
-        if self.place is not None:
-            total = total + self.place[..., rows, cols]
-        if self.place_bound is not None:
-            total = total + self.place_bound[..., moves, rows, cols]
-
-        total = np.where(moves < 0, 0.0, total)
-        return total if self.place_robot is None else total + self.place_robot.at(bounds)
-
-    def draw(self, index: np.ndarray) -> Self:
-        """See `Drift.draw`."""
-        places: dict[str, Any] = {name: effect[index] for name, effect in self.places.items()}
-        if self.place_robot is not None:
-            places["place_robot"] = self.place_robot.draw(index)
-        return self._replace(weights=self.weights[index], b=self.b[index], **places)
-
-    def mean(self) -> Self:
-        """See `Drift.mean`."""
-        means: dict[str, Any] = {n: v.mean(0, keepdims=True) for n, v in self.places.items()}
-        if self.place_robot is not None:
-            means["place_robot"] = self.place_robot.mean()
-        weights = self.weights.mean(0, keepdims=True)
-        return self._replace(weights=weights, b=self.b.mean(0, keepdims=True), **means)
-
-    def in_order(self, own: Order, wanted: Order) -> Self:
-        """See `Drift.in_order`."""
-        robots = _positions("robot", own, wanted)
-        features = _positions("feature", own, wanted)
-        n = self.weights.ndim
-        changed: dict[str, Any] = {
-            "weights": np.take(self.weights, features, axis=1 if n == 4 else -1)
-        }
-        if n > 2:
-            changed["weights"] = np.take(changed["weights"], robots, axis=n - 2)
-        if n == 4:
-            changed["weights"] = changed["weights"][..., robots]
-        if self.b.ndim > 1:
-            changed["b"] = self.b[:, robots]
-        for name, effect in self.places.items():
-            if effect.shape[1] > 1:
-                changed[name] = effect[:, robots]
-        if self.place_robot is not None:
-            known = self.place_robot.known[:, robots]
-            changed["place_robot"] = self.place_robot._replace(known=known)
-        return self._replace(**changed)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -204,16 +76,19 @@ class Draws(Summary):
     in memory.
 
     Attributes:
-        form: Parameters (draw, ...) of the equation by name: the arguments of `independent_robots`
-            or `coupled_robots`, or the fields of a `StateSpace`. Further axes are those of robots.
-        drifts: Terms of the inputs, whose sum is used. The first one depends on the features.
+        arrays: Parameters (draw, ...) by name: those of the equation (arguments of
+            `independent_robots` or `coupled_robots`, or fields of `StateSpace`), feature weights
+            `beta` or `B`, the intercept `b`, and effects of places `place` and `place_bound`.
+        own: Drift that is added to the linear inputs, or None.
+        place_robot: Effects of robots in bounds, or None.
         robots: Names of the robots, in the order of the arrays; None if they are not known.
         features: Names of the features, in the order of the arrays; None if they are not known.
         memory: Quantity carried over between bounds, `"level"` or `"deviation"`; see `PooledTrust`.
     """
 
-    form: Mapping[str, np.ndarray]
-    drifts: tuple[Drift, ...]
+    arrays: Mapping[str, np.ndarray]
+    own: OwnDrift | None = None
+    place_robot: RobotsInBounds | None = None
     robots: Names | None = None
     features: Names | None = None
     memory: str = "level"
@@ -227,44 +102,54 @@ class Draws(Summary):
     def _rows(self) -> Rows:
         n = self.n_draws
         rows = [("draws", f"{n} draws, mean +- sd" if n > 1 else "one draw")]
-        for name, value in self.values.items():
-            rows.append((name, _written(value)))
-        return rows
+        return rows + [(name, _written(value)) for name, value in self.values.items()]
 
     @property
-    def values(self) -> dict[str, np.ndarray]:
+    def values(self) -> Mapping[str, np.ndarray]:
         """Parameters (draw, ...) by name; those of a function are its variables."""
-        own = self.drifts[0].values
-        return own if "transition" in self.form else {**self.form, **own}
+        return self.arrays if self.own is None else self.own.values
 
     @property
     def n_draws(self) -> int:
         """Number of draws."""
-        return len(next(iter(self.form.values())))
+        return len(self._first)
+
+    @property
+    def _first(self) -> np.ndarray:
+        """Transition matrix or autoregression coefficient, which is the first parameter."""
+        return next(iter(self.arrays.values()))
 
     @property
     def n_robots(self) -> int | None:
         """Number of robots; None if the parameters are the same for all robots."""
-        return self.drifts[0].n_robots
+        if self.own is not None:
+            return len(self.robots or ())
+        if self.place_robot is not None:
+            return self.place_robot.known.shape[1]
+        if self.arrays["b"].ndim > 1:
+            return self.arrays["b"].shape[1]
+        n = max((self.arrays[name].shape[1] for name in PLACES if name in self.arrays), default=1)
+        return n if n > 1 else None
 
     @property
     def n_features(self) -> int:
         """Number of features."""
-        return self.drifts[0].n_features
+        if self.own is not None:
+            return len(self.features or ())
+        return self.arrays["B"].shape[1] if "B" in self.arrays else self.arrays["beta"].shape[-1]
 
     @property
     def by_robot(self) -> bool:
         """Whether the robots' mean trust does not obey the equation of a single robot."""
-        first = next(iter(self.form.values()))
-        return first.size > len(first)
+        return self._first.size > self.n_draws
 
     @property
     def grid_shape(self) -> tuple[int, int] | None:
         """Shape (row, col) of the map on whose cells the inputs depend; None if on no cell."""
-        for drift in self.drifts:
-            if drift.grid_shape is not None:
-                return drift.grid_shape
-        return None
+        for name in PLACES:
+            if name in self.arrays:
+                return self.arrays[name].shape[-2:]
+        return self.own.shape if self.own is not None else None
 
     @property
     def carried(self) -> bool:
@@ -274,24 +159,16 @@ class Draws(Summary):
     @property
     def initial_offset(self) -> np.ndarray:
         """Offset (draw,) before the first bound, so that trust is x0_mean in any case."""
-        return np.zeros(self.n_draws) if self.carried else self.form["x0_mean"]
-
-    @property
-    def linear(self) -> LinearDrift | None:
-        """Linear term of the inputs, which contains the effects of places; None without one."""
-        last = self.drifts[-1]
-        return last if isinstance(last, LinearDrift) else None
+        return np.zeros(self.n_draws) if self.carried else self.arrays["x0_mean"]
 
     def require_valid(self, n_robots: int, n_features: int) -> None:
         """Raise TrustboError if the draws are for other numbers of robots or features."""
-        for what, own, given in (
-            ("robots", self.n_robots, n_robots),
-            ("features", self.n_features, n_features),
-        ):
-            if own not in (None, given):
+        own = {"robots": self.n_robots, "features": self.n_features}
+        for what, given in {"robots": n_robots, "features": n_features}.items():
+            if own[what] not in (None, given):
                 raise TrustboError(
-                    f"the parameters are for {own} {what}, not {given}; give parameters of the "
-                    f"same {what}."
+                    f"the parameters are for {own[what]} {what}, not {given}; give parameters of "
+                    f"the same {what}."
                 )
 
     def require_grid(self, shape: tuple[int, ...]) -> None:
@@ -314,18 +191,24 @@ class Draws(Summary):
             "robot": wanted["robot"] if self.n_robots is None else self.robots or wanted["robot"],
             "feature": self.features or wanted["feature"],
         }
-        named = self._with(robots=wanted["robot"], features=wanted["feature"])
-        if own == wanted:
-            return named
+        if self.own is not None:
+            self.own.require_order(own, wanted)
 
-        drifts = tuple(drift.in_order(own, wanted) for drift in self.drifts)
-        order = _positions("robot", own, wanted)
-        form = {}
-        for name, value in self.form.items():
-            for axis in range(1, value.ndim):
-                value = np.take(value, order, axis=axis)
-            form[name] = value
-        return named._with(drifts=drifts, form=form)
+        order = {axis: _positions(axis, own[axis], names) for axis, names in wanted.items()}
+        order |= {"effect": order["robot"], **dict.fromkeys(("move", "row", "col"))}
+        arrays = dict(self.arrays)
+        for name, value in self.arrays.items():
+            axes = _AXES.get(name, ())[1 - value.ndim :] if value.ndim > 1 else ()
+            for i, axis in enumerate(axes, start=-len(axes)):
+                turn = order[axis]
+                if turn is not None and value.shape[i] > 1:
+                    arrays[name] = np.take(arrays[name], turn, axis=i)
+
+        in_bounds = self.place_robot
+        if in_bounds is not None and order["robot"] is not None:
+            in_bounds = in_bounds._replace(known=in_bounds.known[:, order["robot"]])
+        names = {"robots": wanted["robot"], "features": wanted["feature"]}
+        return self._with(arrays=arrays, place_robot=in_bounds, **names)
 
     def state_space(self, n_robots: int, *, adds_noise: bool = True) -> StateSpace:
         """Return the model's equation at each draw.
@@ -334,18 +217,20 @@ class Draws(Summary):
             n_robots: Number of robots.
             adds_noise: Whether the observation family adds noise (see `coupled_robots`).
         """
-        values: dict[str, Any] = dict(self.form)
-        if "transition" in values:
-            return StateSpace(**values)
+        form: dict[str, Any] = {n: v for n, v in self.arrays.items() if n not in _OF_INPUTS}
+        if "transition" in form:
+            return StateSpace(**form)
         if not self.carried:
-            values["x0_mean"] = 0.0
+            form["x0_mean"] = 0.0
 
-        if "B0" in values:
-            return coupled_robots(**values, adds_noise=adds_noise)
-        return independent_robots(**values, n_members=n_robots if "delta_s" in values else 1)
+        if "B0" in form:
+            return coupled_robots(**form, adds_noise=adds_noise)
+        return independent_robots(**form, n_members=n_robots if "delta_s" in form else 1)
 
     def inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
         """Compute the input u of bounds, which is carried over to later bounds if `carried`.
+
+        The linear input is u = sum_m beta_m z_m + b, with any effects of places.
 
         Args:
             awareness: Situational awareness, shape (robot, move, row, col, feature) of all bounds
@@ -356,15 +241,48 @@ class Draws(Summary):
         Returns:
             Inputs (draw, robot, move, row, col) or (draw, robot, bound).
         """
-        u = self.drifts[0].inputs(awareness, bounds)
-        for drift in self.drifts[1:]:
-            u = u + drift.inputs(awareness, bounds)
-        return u
+        if self.own is None:
+            return self._linear_inputs(awareness, bounds)
+        u = self.own.inputs(awareness, bounds)
+        return u + self._linear_inputs(awareness, bounds) if "b" in self.arrays else u
+
+    def _linear_inputs(self, awareness: np.ndarray, bounds: np.ndarray | None) -> np.ndarray:
+        """Compute the inputs without those of `own`."""
+        flat = awareness.reshape(len(awareness), -1, awareness.shape[-1])
+        b = self.arrays["b"]
+        if "B" in self.arrays:
+            u = np.einsum("...mai,...ikm->...ak", self.arrays["B"], flat)
+        elif b.ndim > 1:
+            u = np.einsum("...im,...ikm->...ik", self.arrays["beta"], flat)
+        else:
+            u = np.tensordot(self.arrays["beta"], flat, (-1, -1))
+        u += b.reshape(len(b), -1, 1)  # in place, because the array may be large
+        if bounds is not None:
+            return u + self._at_places(bounds) if self.grid_shape else u
+
+        u = u.reshape(*u.shape[:2], *awareness.shape[1:-1])
+        if "place" in self.arrays:  # the effect of a cell is the same for all moves that enter it
+            u = u + self.arrays["place"][:, :, None]
+        if "place_bound" in self.arrays:
+            u = u + self.arrays["place_bound"]
+        return u if self.place_robot is None else u + self.place_robot.everywhere()
+
+    def _at_places(self, bounds: np.ndarray) -> np.ndarray:
+        """Return the effects (draw, effect, bound) of places; effects of the move -1 are 0."""
+        moves, rows, cols = np.asarray(bounds).T
+        total: Any = 0.0
+        if "place" in self.arrays:
+            total = total + self.arrays["place"][..., rows, cols]
+        if "place_bound" in self.arrays:
+            total = total + self.arrays["place_bound"][..., moves, rows, cols]
+
+        total = np.where(moves < 0, 0.0, total)
+        return total if self.place_robot is None else total + self.place_robot.at(bounds)
 
     def team_inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
         """Compute the mean of `inputs` over robots, with the axis (robot,) of length 1."""
-        if all(drift.is_shared for drift in self.drifts):
-            awareness = awareness.mean(0, keepdims=True)  # the weights apply to the mean
+        if self.own is None and self.arrays["b"].ndim == 1:  # the weights apply to the mean
+            awareness = awareness.mean(0, keepdims=True)
         return self.inputs(awareness, bounds).mean(1, keepdims=True)
 
     def as_inputs(self, u: Any) -> Inputs:
@@ -374,13 +292,19 @@ class Draws(Summary):
     def draw(self, index: Any) -> Self:
         """Select draws by number, by a list of numbers or by a slice."""
         some = np.atleast_1d(np.arange(self.n_draws)[index])
-        form = {name: value[some] for name, value in self.form.items()}
-        return self._with(form=form, drifts=tuple(drift.draw(some) for drift in self.drifts))
+        return self._with(
+            arrays={name: value[some] for name, value in self.arrays.items()},
+            own=self.own and self.own.draw(some),
+            place_robot=self.place_robot and self.place_robot.draw(some),
+        )
 
     def mean(self) -> Self:
         """Average the equation and the inputs over all draws; the result has one draw."""
-        form = {name: value.mean(0, keepdims=True) for name, value in self.form.items()}
-        return self._with(form=form, drifts=tuple(drift.mean() for drift in self.drifts))
+        return self._with(
+            arrays={name: value.mean(0, keepdims=True) for name, value in self.arrays.items()},
+            own=self.own and self.own.mean(),
+            place_robot=self.place_robot and self.place_robot.mean(),
+        )
 
     def record(self) -> dict[str, Any]:
         """Return a description for files, as plain values; without effects of robots in bounds."""
@@ -389,26 +313,27 @@ class Draws(Summary):
 
     def with_robots_in_bounds(self, other: "Draws") -> Self:
         """Return the draws with the effects of robots in bounds of other draws, if any."""
-        if self.linear is None or other.linear is None or other.linear.place_robot is None:
-            return self
-        linear = self.linear._replace(place_robot=other.linear.place_robot)
-        return self._with(drifts=(*self.drifts[:-1], linear))
+        return self._with(place_robot=other.place_robot)
 
     def _with(self, **fields: Any) -> Self:
         """Return a copy with other values of some fields."""
-        other = copy(self)
-        vars(other).update(fields)
-        return other
+        changed = copy(self)
+        vars(changed).update(fields)
+        return changed
 
 
-def _positions(axis: str, own: Order, wanted: Order) -> list[int]:
-    """Return the position of each wanted robot or feature; raises TrustboError if names differ."""
-    if sorted(own[axis]) != sorted(wanted[axis]):
+def _positions(axis: str, own: Sequence[str], wanted: Sequence[str]) -> list[int] | None:
+    """Return the position of each wanted name; None if they are in order.
+
+    Raises TrustboError if the names differ.
+    """
+    if sorted(own) != sorted(wanted):
         raise TrustboError(
-            f"the parameters have the {axis}s {', '.join(own[axis])}, not "
-            f"{', '.join(wanted[axis])}; give parameters of the same names."
+            f"the parameters have the {axis}s {', '.join(own)}, not {', '.join(wanted)}; give "
+            "parameters of the same names."
         )
-    return [list(own[axis]).index(name) for name in wanted[axis]]
+    order = [list(own).index(name) for name in wanted]
+    return None if order == sorted(order) else order
 
 
 def _written(draws: np.ndarray) -> str:

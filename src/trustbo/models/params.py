@@ -9,7 +9,7 @@ import xarray as xr
 
 from trustbo.arrays import Names, as_names, read_labelled, require_numbers
 from trustbo.errors import TrustboError
-from trustbo.models.draws import Draws, LinearDrift
+from trustbo.models.draws import PLACES, Draws
 from trustbo.models.robots_in_bounds import RobotsInBounds
 
 Numbers = Any
@@ -23,13 +23,6 @@ COUPLED_DIMS: Mapping[str, tuple[str, ...]] = {
     "Delta_v": ("robot", "robot_"),
 }
 """Axes of the parameters of the coupled model."""
-_PLACES = {
-    "place": ("effect", "row", "col"),
-    "place_bound": ("effect_of_bound", "move", "row", "col"),
-}
-"""Axes of the effects of places, of which the first has one entry, or one for each robot."""
-_OF_DRIFT = ("beta", "B", "b", *_PLACES)
-"""Parameters that are not part of the equation."""
 
 
 class LinearParams(Draws):
@@ -52,30 +45,18 @@ class LinearParams(Draws):
             TrustboError: If a value is not a number, is infinite or exceeds 1e12, or if sizes,
                 labels or names differ. Effects of places may be NaN where a map has no bound.
         """
-        names = {
-            "robot": as_names("robots", robots or ()),
-            "feature": as_names("features", features or ()),
-        }
+        own_robots = as_names("robots", robots or ()) or None
+        own_features = as_names("features", features or ()) or None
+        names = {"robot": own_robots, "robot_": own_robots, "feature": own_features}
         given = {name: value for name, value in values.items() if value is not None}
         arrays = _arrays_of(given, self.dims, names)
-        weights = arrays["B" if "B" in arrays else "beta"]
-        places = {name: arrays[name] for name in _PLACES if name in arrays}
-        drift = LinearDrift(weights, arrays["b"], **places, place_robot=place_robot)
-        form = {name: value for name, value in arrays.items() if name not in _OF_DRIFT}
-        Draws.__init__(
-            self, form, (drift,), names["robot"] or None, names["feature"] or None, memory
-        )
+        Draws.__init__(self, arrays, None, place_robot, own_robots, own_features, memory)
 
     @property
     def arguments(self) -> dict[str, Any]:
         """Arguments that make these parameters."""
-        names = {"robots": self.robots, "features": self.features}
-        return {**self.values, **names, "place_robot": self.place_robot}
-
-    @property
-    def place_robot(self) -> RobotsInBounds | None:
-        """Effects of robots in bounds, or None."""
-        return self.linear and self.linear.place_robot
+        others = ("place_robot", "robots", "features")
+        return {**self.arrays, **{name: getattr(self, name) for name in others}}
 
     def replace(self, **changes: Any) -> Self:
         """Return the parameters with other values of some arguments.
@@ -114,7 +95,7 @@ class TrustParams(LinearParams):
 
     Raises:
         TrustboError: If a value is not a number, is infinite or exceeds 1e12, or if sizes or names
-            differ. If an array has labels and another one has none, the names must be given.
+            differ. An array with labels needs the names `robots` or `features`.
 
     Example:
         >>> beta = np.array([0.1, 0.1, 0.3])  # of traversability, visibility and line of sight
@@ -122,7 +103,7 @@ class TrustParams(LinearParams):
         >>> tb.simulation.ModelSimulator(workspace, truth).run(path, seed=0).contact_rate
     """
 
-    dims: ClassVar = {"beta": ("feature",), **_PLACES}
+    dims: ClassVar = {"beta": ("feature",), **PLACES}
 
     def __init__(
         self,
@@ -180,7 +161,7 @@ class RobotParams(TrustParams):
     dims: ClassVar = {
         "beta": ("robot", "feature"),
         **dict.fromkeys(("beta0", "b", "delta_w", "delta_v"), ("robot",)),
-        **_PLACES,
+        **PLACES,
     }
 
 
@@ -202,7 +183,7 @@ class CoupledParams(LinearParams):
         >>> params.B0.mean(axis=0)  # influence of each robot on each other one
     """
 
-    dims: ClassVar = {**COUPLED_DIMS, **_PLACES}
+    dims: ClassVar = {**COUPLED_DIMS, **PLACES}
 
     def __init__(
         self,
@@ -232,7 +213,7 @@ class CoupledParams(LinearParams):
         }
         self._set(values, place_robot, robots, features)
         for name in ("Delta_w", "Delta_v"):
-            _require_covariance(name, self.form[name])
+            _require_covariance(name, self.arrays[name])
 
 
 Params = TrustParams | RobotParams | CoupledParams
@@ -257,66 +238,42 @@ def assemble_params(parameters: Mapping[str, np.ndarray], **others: Any) -> Para
 
 
 def _arrays_of(
-    given: Mapping[str, Numbers], dims: Mapping[str, tuple[str, ...]], names: dict[str, Names]
+    given: Mapping[str, Numbers],
+    dims: Mapping[str, tuple[str, ...]],
+    names: Mapping[str, Names | None],
 ) -> dict[str, np.ndarray]:
-    """Return parameters as arrays (draw, ...), and add names of robots and features from labels."""
-    variables = {}
-    sources: dict[tuple[str, bool], str] = {}  # a parameter with and one without labels, by axis
-    named = {axis: bool(known) for axis, known in names.items()}
+    """Return parameters as arrays (draw, ...)."""
+    arrays = {}
     for name, value in given.items():
+        what = f"params.{name}"
         axes = dims.get(name, ())
-        array, labelled = _array_of(name, value, axes, names)
-        sources |= {(axis, axis in labelled): name for axis in names if axis in axes}
-        variables[name] = (("draw", *axes)[-array.ndim :] if array.ndim else ()), array
+        if axes or isinstance(value, xr.DataArray):
+            leading = [str(dim) for dim in getattr(value, "dims", ()) if dim not in axes]
+            value = read_labelled(what, value, (*leading, *axes), names).values
 
-    for axis, known in names.items():
-        if known and not named[axis] and (axis, False) in sources:
-            raise TrustboError(
-                f"params.{sources[axis, True]} has names of {axis}s, but "
-                f"params.{sources[axis, False]} has none; give the names in its order with "
-                f"{axis}s=."
-            )
+        array = require_numbers(what, value, missing=name in PLACES)
+        if array.ndim < len(axes):
+            raise TrustboError(f"{what} must end in the axes {axes}; got the shape {array.shape}.")
+        arrays[name] = array.reshape(-1, *array.shape[array.ndim - len(axes) :])
 
-    coords = {axis: list(known) for axis, known in names.items() if known}
+    n_draws = max(len(array) for array in arrays.values())
+    for name, array in arrays.items():
+        if len(array) == 1:
+            arrays[name] = np.broadcast_to(array, (n_draws, *array.shape[1:]))
+
+    # Axes of the same name must have the same length, unless effects of places are common.
+    coords = {axis: list(known) for axis, known in names.items() if known and axis != "robot_"}
+    variables = {}
+    for name, array in arrays.items():
+        axes = ["draw", *dims.get(name, ())]
+        if name in PLACES:
+            axes[1] = f"effect of {name}" if array.shape[1] == 1 else "robot"
+        variables[name] = axes, array
     try:
-        sizes = xr.Dataset(variables, coords).sizes
+        xr.Dataset(variables, coords)
     except ValueError as error:
         raise TrustboError(f"the parameters do not fit together: {error}.") from None
-    of_robots = {sizes[axis] for axis in ("robot", "effect", "effect_of_bound") if axis in sizes}
-    if len(of_robots - {1}) > 1:
-        raise TrustboError(
-            f"the effects of places must be those of one or of all robots; got sizes {of_robots}."
-        )
-
-    n_draws = sizes.get("draw", 1)
-    arrays = {}
-    for name, (_, array) in variables.items():
-        n_axes = len(dims.get(name, ()))
-        arrays[name] = np.broadcast_to(array, (n_draws, *array.shape[array.ndim - n_axes :]))
     return arrays
-
-
-def _array_of(
-    name: str, value: Numbers, axes: tuple[str, ...], names: dict[str, Names]
-) -> tuple[np.ndarray, dict[str, Names]]:
-    """Return a parameter with at most one axis before `axes`, and the names along its axes."""
-    what = f"params.{name}"
-    found: dict[str, Names] = {}
-    if axes or isinstance(value, xr.DataArray):
-        leading = [str(dim) for dim in getattr(value, "dims", ()) if dim not in axes]
-        dims = *leading, *axes
-        found = read_labelled(what, value, dims, names | {"robot_": ()}).coords
-        names |= {axis: found[axis] for axis in names if axis in found}
-        # The names along the first axis of a matrix are those of its second axis.
-        value = read_labelled(what, value, dims, names | {"robot_": names["robot"]}).values
-
-    array = require_numbers(what, value, missing=name in _PLACES)
-    core = array.shape[array.ndim - len(axes) :]
-    if array.ndim < len(axes):
-        raise TrustboError(f"{what} must end in the axes {axes}; got the shape {array.shape}.")
-    if array.ndim > len(axes) + 1:  # such as (chain, draw)
-        array = array.reshape(-1, *core)
-    return array, found
 
 
 def _require_covariance(name: str, value: np.ndarray) -> None:

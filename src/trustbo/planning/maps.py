@@ -26,8 +26,8 @@ def maps_of(problem: Problem, draws: Draws) -> xr.Dataset:
         "cost": (cost_of(trust).mean("draw"), "mean cost 1 - sigma(trust)"),
         "path_probability": (passable.copy(data=share), "P(cell on the best path)"),
     }
-    if draws.linear is not None and draws.linear.place is not None:
-        place = xr.DataArray(draws.linear.place.mean(1), dims=("draw", "row", "col"))
+    if "place" in draws.arrays:
+        place = xr.DataArray(draws.arrays["place"].mean(1), dims=("draw", "row", "col"))
         maps["place_mean"] = place.mean("draw"), "mean place effect"
         maps["place_sd"] = place.std("draw"), "sd of the place effect"
 

@@ -18,7 +18,7 @@ from trustbo.inference.functions.data import (
 )
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.models.backend import own_settings
-from trustbo.models.draws import Draws, Drift, Order
+from trustbo.models.draws import PLACES, Draws, Order
 from trustbo.models.params import assemble_params
 from trustbo.statespace import Inputs, StateSpace
 
@@ -41,7 +41,7 @@ class FunctionDrift:
         values: Draws (draw, ...) of its variables by name, except those of single missions.
         robots: Names of the robots.
         features: Names of the features.
-        shape: Number of rows and columns of the map; None without a map.
+        shape: Shape (row, col) of the map on whose cells the drift depends; None if on no cell.
         number: Number of each draw, shape (draw,), from which the variables of single missions are
             drawn.
         of_mean: Whether the drift is averaged over all draws.
@@ -56,24 +56,9 @@ class FunctionDrift:
     of_mean: bool = False
 
     @property
-    def is_shared(self) -> bool:
-        """See `Drift.is_shared`."""
-        return False
-
-    @property
     def n_robots(self) -> int:
-        """See `Drift.n_robots`."""
+        """Number of robots."""
         return len(self.robots)
-
-    @property
-    def n_features(self) -> int:
-        """See `Drift.n_features`."""
-        return len(self.features)
-
-    @property
-    def grid_shape(self) -> tuple[int, int] | None:
-        """See `Drift.grid_shape`."""
-        return self.shape if {"cell", "bound"} & {*self.model.inputs} else None
 
     def space(self) -> StateSpace:
         """Return the form (draw, group, member), which is the same for all bounds."""
@@ -146,7 +131,7 @@ class FunctionDrift:
 
     def nothing(self) -> dict[str, Any]:
         """Return the inputs of a mission with one bound, and without awareness of it."""
-        return self._data(np.zeros((1, self.n_robots, self.n_features)), np.full((1, 3), -1))
+        return self._data(np.zeros((1, self.n_robots, len(self.features))), np.full((1, 3), -1))
 
     def _data(self, z: np.ndarray, bounds: np.ndarray) -> dict[str, Any]:
         """Return the inputs of bounds; `z` has the shape (bound, robot, feature)."""
@@ -225,7 +210,7 @@ class FunctionDrift:
         return {name: drawn[name] for name in names}
 
     def draw(self, index: np.ndarray) -> Self:
-        """See `Drift.draw`; a mean is the only draw."""
+        """See `OwnDrift.draw`; a mean is the only draw."""
         return self if self.of_mean else self._some(index)
 
     def _some(self, index: Any) -> Self:
@@ -234,13 +219,12 @@ class FunctionDrift:
         return replace(self, values=values, number=self.number[index])
 
     def mean(self) -> Self:
-        """See `Drift.mean`."""
+        """See `OwnDrift.mean`."""
         return replace(self, of_mean=True)
 
-    def in_order(self, own: Order, wanted: Order) -> Self:
-        """See `Drift.in_order`; a function cannot change the order, in which it was fitted."""
+    def require_order(self, own: Order, wanted: Order) -> None:
+        """See `OwnDrift.require_order`; a function reads robots and features by position."""
         require_same_order(self.model.name, own, wanted)
-        return self
 
 
 def function_drift(
@@ -252,7 +236,8 @@ def function_drift(
 ) -> FunctionDrift:
     """Return the drift of a function for draws (draw, ...) of its variables by name."""
     number = np.arange(len(next(iter(values.values()))))
-    return FunctionDrift(model, dict(values), tuple(robots), tuple(features), shape, number)
+    on_map = shape if {"cell", "bound"} & {*model.inputs} else None
+    return FunctionDrift(model, dict(values), tuple(robots), tuple(features), on_map, number)
 
 
 def draws_of_drift(
@@ -269,12 +254,15 @@ def draws_of_drift(
             `inference.draws.with_effects`.
     """
     space = drift.space().with_noise(resolution)
-    form = {name: value for name, value in space._asdict().items() if value is not None}
-    drifts: tuple[Drift, ...] = (drift,)
+    arrays = {name: value for name, value in space._asdict().items() if value is not None}
+    in_bounds = None
     if effects is not None:
         parameters, places = effects
-        drifts += assemble_params(parameters, **places).drifts
-    return Draws(form, drifts, drift.robots, drift.features)
+        linear = assemble_params(parameters, **places)
+        names = ("beta", "b", *PLACES)
+        arrays |= {name: linear.arrays[name] for name in names if name in linear.arrays}
+        in_bounds = linear.place_robot
+    return Draws(arrays, drift, in_bounds, drift.robots, drift.features)
 
 
 def no_weights(theta: Mapping[str, np.ndarray], features: Names) -> dict[str, np.ndarray]:
