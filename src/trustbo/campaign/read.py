@@ -25,7 +25,7 @@ from trustbo.campaign.state import Entry, State
 from trustbo.errors import TrustboError, warn
 from trustbo.files import FilePath, to_path
 from trustbo.inference.functions.function import is_of_function
-from trustbo.inference.learner import ClassLearner, Learner, Model, learner_from_record
+from trustbo.inference.learner import Learner, Model, learner_from_record
 from trustbo.logs.netcdf import missions_from_tree, read_tree
 from trustbo.planning.plan import plan_from_record
 from trustbo.workspace import Workspace
@@ -163,4 +163,4 @@ def _learner_of(state: State, model: Model | None) -> Learner:
         # A model class with custom priors is needed only if nothing has been learned.
         if state.last is None or model is not None or is_of_function(record):
             raise
-        return ClassLearner(None)
+        return Learner(None)

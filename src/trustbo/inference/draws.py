@@ -144,22 +144,7 @@ def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarra
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also for 0 draws
 
 
-def params_of_model(
-    posterior: xr.DataTree, workspace: Workspace | None = None, *, next_mission: bool = False
-) -> Params:
-    """Return all draws of a posterior of a model class; see `learner.params_of`."""
-    return _read_params(posterior, workspace, [next_mission])[0]
-
-
-def expected_and_drawn_of_model(
-    posterior: xr.DataTree, workspace: Workspace | None = None
-) -> tuple[Params, Params]:
-    """Return `params_of` without and with `next_mission`; the posterior is read once."""
-    expected, drawn = _read_params(posterior, workspace, [False, True])
-    return expected, drawn
-
-
-def _read_params(
+def read_params(
     posterior: xr.DataTree, workspace: Workspace | None, next_mission: Sequence[bool]
 ) -> list[Params]:
     """Return the parameters for each value of `next_mission`; see `params_of`."""

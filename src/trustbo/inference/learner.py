@@ -6,7 +6,7 @@ module distinguishes them.
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import xarray as xr
 
@@ -14,11 +14,10 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_kind, see
 from trustbo.inference.draws import (
     as_fitted,
-    expected_and_drawn_of_model,
     in_order_of_features,
     missions_of,
-    params_of_model,
     prior_mean,
+    read_params,
     read_posterior,
     sample_prior,
     sample_prior_ahead,
@@ -57,250 +56,128 @@ _N_MEAN = 500
 """Number of prior draws of a function that are averaged for the first plan."""
 
 
-class Learner(Protocol):
-    """A model that learns from missions and whose draws are used to plan."""
+class Learner:
+    """A model class that learns from missions, and whose draws are used to plan.
 
-    samplers: ClassVar[tuple[str, ...]]
-    """Names of the available samplers, the default first."""
-    model: Any
-    """The model."""
-
-    @property
-    def family(self) -> str:
-        """Name of the observation family of the rates."""
-        ...
-
-    def in_short(self) -> str:
-        """Describe the model in a few words."""
-        ...
-
-    def record(self) -> dict[str, Any]:
-        """Return plain values that identify the model in files."""
-        ...
-
-    def fit(
-        self,
-        missions: Sequence[Mission],
-        *,
-        workspace: Workspace,
-        sampler: str,
-        seed: int,
-        progress: bool,
-        start: xr.DataTree | None,
-        earlier: Sequence[Mission] = (),
-        **options: Any,
-    ) -> xr.DataTree:
-        """Fit the parameters to missions, without the groups of `add_latent`; see `fit`."""
-        ...
-
-    def require_poolable(self, earlier: Sequence[Mission], workspace: Workspace) -> None:
-        """Raise TrustboError if the model cannot be fitted to missions of earlier campaigns."""
-        ...
-
-    def add_latent(
-        self, posterior: xr.DataTree, missions: Sequence[Mission], *, progress: bool = True
-    ) -> xr.DataTree:
-        """Add latent trust, log-likelihoods and predictions to a posterior."""
-        ...
-
-    def draws(
-        self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False
-    ) -> Draws:
-        """Return all draws of a posterior; see `params_of`."""
-        ...
-
-    def expected_and_drawn(
-        self, posterior: xr.DataTree, workspace: Workspace | None
-    ) -> tuple[Draws, Draws]:
-        """Return `draws` without and with `next_mission`; the posterior is read once."""
-        ...
-
-    def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
-        """Draw parameters from the prior without effects, with a leading axis (draw,)."""
-        ...
-
-    def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
-        """Draw parameters from the prior with the effects of the first mission."""
-        ...
-
-    def prior_mean(self, workspace: Workspace) -> Draws:
-        """Return the prior mean, with a leading axis (draw,) of length 1."""
-        ...
-
-
-class ClassLearner:
-    """Learner of a model class; the model is None if it is custom and was read from a file."""
+    Attributes:
+        samplers: Names of the available samplers, the default first.
+        model: The model; None if it is a model class that is not stored, and was not given.
+    """
 
     samplers: ClassVar[tuple[str, ...]] = SAMPLERS
 
-    def __init__(self, model: TrustModel | None) -> None:
+    def __init__(self, model: Any) -> None:
         self.model = model
 
     @property
-    def _known(self) -> TrustModel:
+    def known(self) -> Any:
+        """The model; raises TrustboError if it was not given."""
         if self.model is None:
             raise TrustboError("the model is custom and not stored; give it with model=.")
         return self.model
 
     @property
     def family(self) -> str:
-        """See `Learner.family`."""
-        return self._known.family
+        """Name of the observation family of the rates."""
+        return self.known.family
 
     def in_short(self) -> str:
-        """See `Learner.in_short`."""
-        return self._known.in_short()
+        """Describe the model in a few words."""
+        return self.known.in_short()
 
-    def record(self) -> dict[str, Any]:
-        """See `Learner.record`."""
-        return model_to_record(self._known)
-
-    def fit(
-        self,
-        missions: Sequence[Mission],
-        *,
-        workspace: Workspace,
-        sampler: str,
-        seed: int,
-        progress: bool,
-        start: xr.DataTree | None,
-        earlier: Sequence[Mission] = (),
-        **options: Any,
-    ) -> xr.DataTree:
-        """See `Learner.fit`."""
-        tree = fit(
-            missions,
-            self._known,
-            earlier=earlier,
-            sampler=sampler,
-            workspace=workspace,
-            seed=seed,
-            progress=progress,
-            latent=False,
-            start=start,
-            **options,
-        )
-        return parameters_alone(tree)
-
-    def require_poolable(self, earlier: Sequence[Mission], workspace: Workspace) -> None:
-        """See `Learner.require_poolable`."""
-        require_poolable_with_model(self._known, earlier, workspace.team.names)
+    def fit(self, missions: Sequence[Mission], **options: Any) -> xr.DataTree:
+        """Fit the parameters to missions, without the groups of `add_latent`; see `fit`."""
+        model = getattr(self.known, "function", self.known)
+        return parameters_alone(fit(missions, model, latent=False, **options))
 
     def add_latent(
         self, posterior: xr.DataTree, missions: Sequence[Mission], *, progress: bool = True
     ) -> xr.DataTree:
-        """See `Learner.add_latent`."""
-        # The group `log_prior` requires the model if its priors are not the defaults.
+        """Add latent trust, log-likelihoods and predictions to a posterior."""
         return add_latent(posterior, missions, model=self.model, progress=progress)
 
     def draws(
         self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False
     ) -> Draws:
-        """See `Learner.draws`."""
-        return params_of_model(posterior, workspace, next_mission=next_mission)
+        """Return all draws of a posterior; see `params_of`."""
+        return self.read(posterior, workspace, [next_mission])[0]
 
     def expected_and_drawn(
         self, posterior: xr.DataTree, workspace: Workspace | None
     ) -> tuple[Draws, Draws]:
-        """See `Learner.expected_and_drawn`."""
-        return expected_and_drawn_of_model(posterior, workspace)
+        """Return `draws` without and with `next_mission`; the posterior is read once."""
+        expected, drawn = self.read(posterior, workspace, [False, True])
+        return expected, drawn
+
+    def record(self) -> dict[str, Any]:
+        """Return plain values that identify the model in files."""
+        return model_to_record(self.known)
+
+    def require_poolable(self, earlier: Sequence[Mission], workspace: Workspace) -> None:
+        """Raise TrustboError if the model cannot be fitted to missions of earlier campaigns."""
+        require_poolable_with_model(self.known, earlier, workspace.team.names)
+
+    def with_latent(
+        self, posterior: xr.DataTree, missions: Sequence[Mission], progress: bool
+    ) -> xr.DataTree:
+        """Add the groups of `add_latent`, given missions in the order of the posterior."""
+        fitted, draws = read_posterior(posterior, missions, model=self.model)
+        return with_latent(posterior, missions, fitted, draws, progress=progress)
+
+    def read(
+        self, posterior: xr.DataTree, workspace: Workspace | None, next_mission: Sequence[bool]
+    ) -> Sequence[Draws]:
+        """Return the draws of a posterior for each value of `next_mission`; see `params_of`."""
+        return read_params(posterior, workspace, next_mission)
 
     def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
-        """See `Learner.prior_draws`."""
-        features = workspace.features
-        model = self._known.for_features(features)
+        """Draw parameters from the prior without effects."""
+        model = self.known.for_features(workspace.features)
         n_robots = workspace.team.n_robots
-        return sample_prior(model, len(features), n_draws, seed, n_robots=n_robots)
+        return sample_prior(model, len(workspace.features), n_draws, seed, n_robots=n_robots)
 
     def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
-        """See `Learner.prior_draws_ahead`."""
-        model = self._known.for_features(workspace.features)
+        """Draw parameters from the prior with the effects of the first mission."""
+        model = self.known.for_features(workspace.features)
         return sample_prior_ahead(model, workspace, n_draws, seed)
 
     def prior_mean(self, workspace: Workspace) -> Draws:
-        """See `Learner.prior_mean`."""
-        features = workspace.features
-        model = self._known.for_features(features)
-        return prior_mean(model, len(features), n_robots=workspace.team.n_robots)
+        """Return the prior mean."""
+        model = self.known.for_features(workspace.features)
+        return prior_mean(model, len(workspace.features), n_robots=workspace.team.n_robots)
 
 
-class FunctionLearner:
-    """Learner of a NumPyro function."""
+class FunctionLearner(Learner):
+    """Learner of a NumPyro function; variables of single missions are always drawn."""
 
-    samplers: ClassVar[tuple[str, ...]] = OF_FUNCTIONS
-
-    def __init__(self, model: FunctionModel) -> None:
-        self.model = model
-
-    @property
-    def family(self) -> str:
-        """See `Learner.family`."""
-        return self.model.family
-
-    def in_short(self) -> str:
-        """See `Learner.in_short`."""
-        return self.model.in_short()
+    samplers = OF_FUNCTIONS
 
     def record(self) -> dict[str, Any]:
         """See `Learner.record`."""
         return self.model.record()
 
-    def fit(
-        self,
-        missions: Sequence[Mission],
-        *,
-        workspace: Workspace,
-        sampler: str,
-        seed: int,
-        progress: bool,
-        start: xr.DataTree | None,
-        earlier: Sequence[Mission] = (),
-        **options: Any,
-    ) -> xr.DataTree:
-        """See `Learner.fit`."""
-        tree = fit(
-            missions,
-            self.model.function,
-            earlier=earlier,
-            sampler=sampler,
-            workspace=workspace,
-            seed=seed,
-            progress=progress,
-            latent=False,
-            start=start,
-            **options,
-        )
-        return parameters_alone(tree)
-
     def require_poolable(self, earlier: Sequence[Mission], workspace: Workspace) -> None:
         """See `Learner.require_poolable`."""
         require_poolable_with_function(self.model, earlier, workspace.team.names)
 
-    def add_latent(
-        self, posterior: xr.DataTree, missions: Sequence[Mission], *, progress: bool = True
+    def with_latent(
+        self, posterior: xr.DataTree, missions: Sequence[Mission], progress: bool
     ) -> xr.DataTree:
-        """See `Learner.add_latent`."""
-        return add_latent(posterior, missions, model=self.model.function, progress=progress)
+        """See `Learner.with_latent`."""
+        return with_latent_of_function(posterior, missions, self.model, progress=progress)
 
-    def draws(
-        self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False
-    ) -> Draws:
-        """See `Learner.draws`; variables of single missions are always drawn for the next one."""
-        return draws_of_function(self.model, posterior, workspace, [next_mission])[0]
-
-    def expected_and_drawn(
-        self, posterior: xr.DataTree, workspace: Workspace | None
-    ) -> tuple[Draws, Draws]:
-        """See `Learner.expected_and_drawn`."""
-        expected, drawn = draws_of_function(self.model, posterior, workspace, [False, True])
-        return expected, drawn
+    def read(
+        self, posterior: xr.DataTree, workspace: Workspace | None, next_mission: Sequence[bool]
+    ) -> Sequence[Draws]:
+        """See `Learner.read`."""
+        return draws_of_function(self.model, posterior, workspace, next_mission)
 
     def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
         """See `Learner.prior_draws`."""
         return prior_draws_of_function(self.model, n_draws, seed, workspace)
 
     def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
-        """See `Learner.prior_draws_ahead`; the variables of single missions are always drawn."""
+        """See `Learner.prior_draws_ahead`."""
         return prior_draws_of_function_ahead(self.model, n_draws, seed, workspace)
 
     def prior_mean(self, workspace: Workspace) -> Draws:
@@ -318,11 +195,11 @@ def learner_of(
             cannot be sampled by this sampler.
     """
     if model is None:
-        return ClassLearner(default_model())
+        return Learner(default_model())
     if isinstance(model, HumanTrust):
         raise TrustboError("model: HumanTrust cannot plan paths; give PooledTrust() instead.")
     if isinstance(model, TrustModel):
-        return ClassLearner(model)
+        return Learner(model)
 
     is_function = callable(model) and not isinstance(model, type)
     if not is_function and not isinstance(model, FunctionModel):
@@ -349,7 +226,7 @@ def learner_from_record(record: dict[str, Any], given: Model | None = None) -> L
         return FunctionLearner(model_of_record(record, given))
     if given is not None:
         require_kind("model", given, TrustModel, "give the model of the posterior")
-    return ClassLearner(model_from_record(record, given))  # pyright: ignore[reportArgumentType]
+    return Learner(model_from_record(record, given))  # pyright: ignore[reportArgumentType]
 
 
 def learner_of_posterior(posterior: xr.DataTree, model: Model | None = None) -> Learner:
@@ -357,7 +234,7 @@ def learner_of_posterior(posterior: xr.DataTree, model: Model | None = None) -> 
     record = json.loads(posterior.attrs["model_record"])
     if is_of_function(record):
         return FunctionLearner(model_of_record(record, model))  # pyright: ignore[reportArgumentType]
-    return ClassLearner(model)  # pyright: ignore[reportArgumentType]
+    return Learner(model)  # pyright: ignore[reportArgumentType]
 
 
 @computing()
@@ -368,7 +245,7 @@ def params_of(
     next_mission: bool = False,
     model: Model | None = None,
 ) -> Draws:
-    """Return all draws of a posterior as parameters, with chains joined in a leading axis (draw,).
+    """Return all draws of a posterior as parameters (draw, ...), with chains joined.
 
     Args:
         posterior: DataTree from `fit`.
@@ -446,8 +323,4 @@ def add_latent(
     missions = missions_of(posterior) if missions is None else missions
     missions = in_order_of_features(missions, posterior)
     learner = learner_of_posterior(posterior, model)
-    if isinstance(learner, FunctionLearner):
-        return with_latent_of_function(posterior, missions, learner.model, progress=progress)
-
-    fitted, draws = read_posterior(posterior, missions, model=model)  # pyright: ignore[reportArgumentType]
-    return with_latent(posterior, missions, fitted, draws, progress=progress)
+    return learner.with_latent(posterior, missions, progress)
