@@ -462,8 +462,8 @@ class Campaign(Recorder):
 
         Args:
             directory: Folder that was passed as `directory`, or to `Result.save`.
-            model: Model of the campaign; required if the model or its priors are custom, or if it
-                is a NumPyro function.
+            model: Model of the campaign; required if it is a NumPyro function, or if a prior has a
+                class of your own.
             policy: Policy of the campaign; required if it is a custom function.
             progress: Whether to report missions that are used now and to show progress bars, in
                 this call and in later ones.

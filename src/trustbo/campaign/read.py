@@ -132,8 +132,8 @@ def load_result(
 
     Args:
         directory: Folder of a campaign, or a folder written by `Result.save`.
-        model: Model of the campaign; needed if it is a NumPyro function, or if it is custom and
-            nothing has been learned.
+        model: Model of the campaign; needed if it is a NumPyro function, or if a prior has a class
+            of your own and nothing has been learned.
         progress: Whether to show a progress bar if `posterior` takes longer than 1.5 seconds.
 
     Raises:
@@ -160,7 +160,7 @@ def _learner_of(state: State, model: Model | None) -> Learner:
     try:
         return learner_from_record(record, model)
     except TrustboError:
-        # A model class with custom priors is needed only if nothing has been learned.
+        # A model class with priors of own classes is needed only if nothing has been learned.
         if state.last is None or model is not None or is_of_function(record):
             raise
         return Learner(None)

@@ -473,7 +473,7 @@ def read_posterior(
         posterior: DataTree from `fit`.
         missions: Fitted missions, with the features in the order of the posterior; needed if the
             posterior contains no data.
-        model: Model of the posterior; needed if the priors are custom.
+        model: Model of the posterior; needed if a prior has a class of the user's own.
 
     Raises:
         TrustboError: If the posterior contains no data and no missions are given, a custom model is
@@ -487,7 +487,7 @@ def read_posterior(
         require_kind("model", model, TrustModel, "give the model of the posterior")
         model = model.for_features(features)
     record = json.loads(posterior.attrs["model_record"])
-    model = model_from_record(record, model, features).for_features(features)
+    model = model_from_record(record, model).for_features(features)
 
     fitted = Density(model, model.observations(missions))
     groups = {"posterior": parameters_of(posterior)}

@@ -300,8 +300,8 @@ def add_latent(
     Args:
         posterior: DataTree from `fit`, or one of `Result.posteriors`.
         missions: Fitted missions; needed if the posterior contains no data.
-        model: Model of the posterior; needed if the priors are custom, or if it is a NumPyro
-            function that was not used before in this process.
+        model: Model of the posterior; needed if a prior has a class of your own, or if it is a
+            NumPyro function that was not used before in this process.
         progress: Whether to show a progress bar after 1.5 seconds.
 
     Returns:

@@ -240,7 +240,7 @@ class TrustModel(Summary, ABC):
         priors are for other features.
         """
         priors = self.priors
-        if priors is Priors.default(self.family):
+        if priors.by_feature:
             priors = Priors.from_features(tuple(features), self.family)
 
         priors = priors.in_order_of(features)
@@ -325,7 +325,7 @@ class TrustModel(Summary, ABC):
         own = [name for name in hyperpriors if name not in texts and name not in _PRIOR_OF]
 
         rows = []
-        if self.priors is Priors.default(self.family):
+        if self.priors.by_feature:
             used -= {"beta", "b"}
             rows.append(("prior of beta, b", "by the features, see Priors.from_features"))
 

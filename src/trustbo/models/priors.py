@@ -1,11 +1,12 @@
 """Priors on the parameters of the trust models."""
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
-from threading import Lock
-from typing import Any, SupportsIndex
+from functools import cache, partial
+from typing import Any, Self
 
+import jax
 import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
@@ -32,11 +33,6 @@ _FEATURE_SD = 0.25
 _INTERCEPT_SD = 0.15
 _MIDDLE = 0.5
 """Contact rate that `Priors.for_cells` expects in every cell, the middle of [0, 1]."""
-
-
-_LOCK = Lock()
-_DEFAULTS: dict[str, "Priors"] = {}
-"""The objects that `Priors.default` returns, by family."""
 
 
 def _built(kind: Any, *parameters: float) -> Distribution:
@@ -72,6 +68,7 @@ class Priors(Summary):
         features: Names of the features of `beta`. Data with the same features in another order use
             the priors by name, and data with other features are refused. If it is None, the priors
             are in the order of the features of the data.
+        by_feature: Whether a model uses the priors of `from_features` instead, as with `default`.
 
     Raises:
         TrustboError: If a prior has the wrong shape or support, the prior on a weight is not
@@ -96,6 +93,7 @@ class Priors(Summary):
     x0_sd: float = 0.5
     stationary: bool = False
     features: Sequence[str] | None = None
+    by_feature: bool = field(default=False, init=False)  # not copied to changed priors
 
     def _rows(self) -> Rows:
         return list(self.describe().items())
@@ -104,8 +102,9 @@ class Priors(Summary):
         for name in (one.name for one in fields(self) if one.type is Distribution):
             prior = getattr(self, name)
             if wanted := _wanted(name, prior):
-                got = as_text(prior) if isinstance(prior, Distribution) else repr(prior)
-                raise TrustboError(f"the prior Priors.{name} must be {wanted}; got {got}.")
+                raise TrustboError(
+                    f"the prior Priors.{name} must be {wanted}; got {as_text(prior)}."
+                )
 
         numbers = {
             "concentration": require_positive("Priors.concentration", self.concentration),
@@ -121,27 +120,30 @@ class Priors(Summary):
             object.__setattr__(self, "features", tuple(features))
             self.coefficients(len(features))
 
-    @classmethod
-    def default(cls, family: str) -> "Priors":
-        """Return the default priors for an observation family; each call returns the same object.
+    @staticmethod
+    def default(family: str) -> "Priors":
+        """Return the default priors for an observation family.
 
-        A model with this object uses the priors of `from_features`, so the object is the same in
-        all threads and copies.
+        A model with these priors uses those of `from_features` for the features of its data.
 
         The family `"beta_binomial"` has wider priors because trust is a logit: beta_m ~ N(0, 2^2),
         b ~ N(0, 1), delta_w ~ HalfNormal(0.5) and x_0 ~ N(0, 1.5^2).
         """
-        with _LOCK:
-            if family not in _DEFAULTS:
-                _DEFAULTS[family] = cls(**FAMILIES[family].priors())
-            return _DEFAULTS[family]
+        return _default(family)
 
-    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
-        """Copy and unpickle default priors as the same object; see `default`."""
-        for family in FAMILIES:
-            if self is _DEFAULTS.get(family):
-                return Priors.default, (family,)
-        return super().__reduce_ex__(protocol)
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Self:
+        """Rebuild priors from their `record`.
+
+        Raises TrustboError if the class of a prior is not one of NumPyro's.
+        """
+        with own_settings():
+            priors = cls(**{name: _from_plain(value) for name, value in record.items()})
+        return priors
+
+    def record(self) -> dict[str, Any]:
+        """Return the priors as plain values, such as {"beta": {"Normal": {"loc": 0.0, ...}}}."""
+        return {one.name: as_plain(getattr(self, one.name)) for one in fields(self) if one.init}
 
     @classmethod
     def from_features(cls, features: Sequence[str], family: str = "gaussian") -> "Priors":
@@ -152,8 +154,7 @@ class Priors(Summary):
         by 1 - beta0, the weights of these features have the prior N(1 / n, 0.3^2 / n), other
         weights have N(0, 0.25^2), and the intercept has N(0, 0.15^2). Most rates drawn from these
         priors are in [0, 1]. For tick counts, the priors are scaled by 5, and a line of sight of
-        0.5 predicts a rate of 0.5. If there is no such feature, `default` is returned, which is the
-        same for all features.
+        0.5 predicts a rate of 0.5. If there is no such feature, the priors are those of `default`.
         """
         features = require_order("features", features)
         features = require_list("features", features, str, "give the names of the features")
@@ -162,7 +163,7 @@ class Priors(Summary):
         default = cls.default(family)
         is_sight = np.array([is_line_of_sight(name) for name in features])
         if not is_sight.any():
-            return default
+            return replace(default)
 
         n = int(is_sight.sum())
         slope, zero = FAMILIES[family].line_of_sight
@@ -258,12 +259,16 @@ class Priors(Summary):
         return log_density(prior, values / inverse_gain) - np.log(inverse_gain)
 
     def describe(self) -> dict[str, str]:
-        """Describe each prior as text, for the record of a posterior."""
-        names = [one.name for one in fields(self) if one.name != "features"]
-        described = {name: as_text(getattr(self, name)) for name in names}
-        if self.features is not None:
-            described["features"] = ", ".join(self.features)
-        return described
+        """Describe each prior as text."""
+        return {name: as_text(v) for name, v in self.record().items() if v is not None}
+
+
+@cache
+def _default(family: str) -> Priors:
+    """See `Priors.default`; it takes JAX some time to make the distributions."""
+    priors = Priors(**FAMILIES[family].priors())
+    object.__setattr__(priors, "by_feature", True)
+    return priors
 
 
 def _wanted(name: str, prior: Any) -> str:
@@ -288,24 +293,54 @@ def _wanted(name: str, prior: Any) -> str:
     return "" if good else wanted
 
 
-def as_text(prior: Distribution | float) -> str:
-    """Format a distribution or a number as text."""
-    if isinstance(prior, bool):
-        return "yes" if prior else "no"
-    if not isinstance(prior, Distribution):
-        return f"{prior:g}"
+def as_plain(value: Any) -> Any:
+    """Return a distribution as {class: arguments}, and anything else as plain values.
 
-    parts = [f"{n}={_numbers(getattr(prior, n))}" for n in type(prior).arg_constraints]
-    is_determined = parts and isinstance(prior, dist.TransformedDistribution)  # e.g. LogNormal
-    base = getattr(prior, "base_dist", None)
-    if base is not None and not is_determined:  # e.g. of a truncated distribution
-        parts.insert(0, as_text(base))
-    return f"{type(prior).__name__}({', '.join(parts)})"
+    The name of a class that `_from_plain` cannot rebuild includes that of its module.
+    """
+    if not isinstance(value, Distribution):
+        return np.asarray(value).tolist()
+
+    kind = type(value)
+    name = kind.__name__
+    arguments = {}
+    for argument in inspect.signature(kind).parameters:
+        given = getattr(value, argument, None)
+        if argument != "validate_args" and given is not None:
+            arguments[argument] = as_plain(given)
+    if getattr(dist, name, None) is not kind or "transforms" in arguments:
+        name = f"{kind.__module__}.{name}"
+        arguments = {"values": [np.asarray(v).tolist() for v in jax.tree.leaves(value)]}
+    return {name: arguments}
 
 
-def _numbers(values: object) -> str:
-    """Format a number or a vector as text."""
-    array = np.asarray(values, dtype=float)
-    if not array.ndim:
-        return f"{array:g}"
-    return f"[{', '.join(f'{v:g}' for v in array)}]"
+def _from_plain(value: Any) -> Any:
+    """Return the distribution or the values of `as_plain`."""
+    if not isinstance(value, Mapping):
+        return value
+
+    [(name, arguments)] = value.items()
+    kind = getattr(dist, name, None)
+    if not (isinstance(kind, type) and issubclass(kind, Distribution)):
+        raise TrustboError(
+            f"the prior {name} is not one of NumPyro's, and cannot be rebuilt from its arguments; "
+            "give the model with model=."
+        )
+    given = {
+        n: np.asarray(v) if isinstance(v, list) else _from_plain(v) for n, v in arguments.items()
+    }
+    return kind(**given)
+
+
+def as_text(value: Any) -> str:
+    """Format a distribution, its `as_plain` or a number as text."""
+    if isinstance(value, Distribution):
+        value = as_plain(value)
+    if isinstance(value, Mapping):
+        [(name, arguments)] = value.items()
+        return f"{name}({', '.join(f'{n}={as_text(v)}' for n, v in arguments.items())})"
+    if isinstance(value, list):
+        return f"[{', '.join(as_text(v) for v in value)}]"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float | int) else repr(value)

@@ -12,16 +12,16 @@ from trustbo.models.priors import Priors
 
 
 def model_to_record(model: TrustModel) -> dict[str, Any]:
-    """Convert a model to a dict of its class, options and effects, and of its priors as text.
+    """Convert a model to a dict of its class, options, effects and priors.
 
     The entry `by_feature` is true if the priors depend on the feature names.
     """
     record = {
         "class": type(model).__name__,
         **model.options(),
-        "priors": model.priors.describe(),
+        "priors": model.priors.record(),
         "effects": effects_to_record(model.effects),
-        "by_feature": model.priors is Priors.default(model.family),
+        "by_feature": model.priors.by_feature,
     }
     return json.loads(json.dumps(record))  # tuples become lists, as in a file
 
@@ -31,13 +31,10 @@ def effects_to_record(effects: Sequence[Any]) -> list[dict[str, Any]]:
     return [{"kind": type(effect).__name__, **asdict(effect)} for effect in effects]
 
 
-def model_from_record(
-    record: dict[str, Any], given: TrustModel | None = None, features: Sequence[str] = ()
-) -> TrustModel:
-    """Rebuild a model from its record; a model with custom priors must be `given`.
+def model_from_record(record: Mapping[str, Any], given: TrustModel | None = None) -> TrustModel:
+    """Rebuild a model from its record; a model with priors of own classes must be `given`.
 
-    The default priors depend on `features`, the feature names of the posterior. Raises TrustboError
-    if a custom model is not given, or if the given model differs from the record.
+    Raises TrustboError if such a model is not given, or if the given model differs from the record.
     """
     if given is not None:
         if model_to_record(given) != record:
@@ -46,21 +43,10 @@ def model_from_record(
             )
         return given
 
-    # The priors are default priors if one of the following gives the same record: `Priors.default`
-    # (the object itself, which stands for priors by feature), equal priors in another object,
-    # `Priors.from_features` or `Priors.for_cells`.
-    default = with_default_priors(record)
-    of_features = Priors.from_features(features, record["family"]).in_order_of(features)
-    of_cells = Priors.for_cells(record["family"])
-    for priors in (default.priors, replace(default.priors), of_features, of_cells):
-        model = replace(default, priors=priors)
-        if model_to_record(model) == record:
-            return model
-
-    raise TrustboError(
-        f"the priors of the model {record['class']} are custom, and cannot be rebuilt from their "
-        f"text {record['priors']}; give the model with model=."
-    )
+    model = with_default_priors(record)
+    if record["by_feature"]:
+        return model
+    return replace(model, priors=Priors.from_record(record["priors"]))
 
 
 def with_default_priors(record: Mapping[str, Any]) -> TrustModel:
