@@ -204,6 +204,19 @@ def evenly_spaced(n: int, n_kept: int) -> np.ndarray:
     return np.linspace(0, n - 1, min(n, n_kept)).astype(int)
 
 
+def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
+    """Return draws (draw, ...) with chains joined and with the other axes in the order `axes`.
+
+    New draws and draws that are read from a file get the same memory layout. Sums then have the
+    same rounding errors, which makes a resumed campaign bit-identical. Effects are stored in single
+    precision, but computations are in double precision.
+    """
+    values = np.ascontiguousarray(array.transpose("chain", "draw", *axes).values)
+    if values.dtype == np.float32:
+        values = values.astype(np.float64)
+    return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also for 0 draws
+
+
 def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:
     """Return names as a tuple; raises TrustboError if one is not a string or is repeated.
 

@@ -3,13 +3,13 @@
 import json
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from trustbo.arrays import in_order
+from trustbo.arrays import in_order, joined_draws
 from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError, require_count, require_kind, require_whole
 from trustbo.inference.density import Density, JointDraws
@@ -121,27 +121,30 @@ def parameters_of(
             )
         parameters[name] = joined_draws(array, axes[name])
 
-    for name, values in parameters.items():
+    require_no_nan(parameters)
+    return parameters
+
+
+def require_no_nan(draws: Mapping[str, np.ndarray]) -> None:
+    """Raise TrustboError if a draw of a parameter is NaN."""
+    for name, values in draws.items():
         bad = np.isnan(values.reshape(len(values), -1)).any(1).sum()
         if bad:
             raise TrustboError(
                 f"{bad} of {len(values)} draws of {name!r} are NaN; drop these "
                 "draws with posterior.isel(draw=...) instead of masking them."
             )
-    return parameters
 
 
-def joined_draws(array: xr.DataArray, axes: Sequence[Any] = (...,)) -> np.ndarray:
-    """Return draws (draw, ...) with chains joined and with the other axes in the order `axes`.
-
-    New draws and draws that are read from a file get the same memory layout. Sums then have the
-    same rounding errors, which makes a resumed campaign bit-identical. Effects are stored in single
-    precision, but computations are in double precision.
-    """
-    values = np.ascontiguousarray(array.transpose("chain", "draw", *axes).values)
-    if values.dtype == np.float32:
-        values = values.astype(np.float64)
-    return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])  # also for 0 draws
+def require_variables(needed: Iterable[str], found: Iterable[Hashable]) -> None:
+    """Raise TrustboError if a variable of the model is not among those of the posterior."""
+    names = [str(name) for name in found]
+    missing = [name for name in needed if name not in names]
+    if missing:
+        raise TrustboError(
+            f"the posterior has no variable {missing[0]!r}, only {', '.join(names)}. Give a "
+            "posterior from trustbo.fit with unchanged names."
+        )
 
 
 def read_params(
@@ -162,12 +165,7 @@ def read_params(
     model = model_of(posterior)
     parameters = parameters_of(posterior, model)
     needed = ("B0", "B") if "B0" in parameters else ("beta0", "beta", "b", "delta_w", "delta_v")
-    missing = [name for name in needed if name not in parameters]
-    if missing:
-        raise TrustboError(
-            f"the posterior has no variable {missing[0]!r}, only {', '.join(parameters)}. Give a "
-            "posterior from trustbo.fit with unchanged names."
-        )
+    require_variables(needed, parameters)
 
     others = {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")}
     others["memory"] = posterior.attrs.get("memory", "level")
@@ -200,30 +198,12 @@ def with_effects(
             and effects of robots in bounds are included. Otherwise, expected effects are used.
 
     Returns:
-        Pairs of the parameters, and of the fields of `Params` with the effects of places.
+        Pairs of the parameters, and of the arguments of `Params` with the effects of places.
     """
-    maps: dict[str, Any] = {}
-    of_robots: dict[str, Any] = {}
-    if "places" in posterior.children:
-        places = posterior["places"].to_dataset()
-        maps |= place_maps_of(places, parameters)
-        if any(next_mission):
-            of_robots["place_robot"] = robots_in_bounds_of(places, parameters, names)
-
+    places = posterior["places"].to_dataset() if "places" in posterior.children else None
     values = {effect: values_of(posterior, effect) for effect in _effects_of_robots(effects)}
-    found = []
-    for is_drawn in next_mission:
-        robots = _robot_effects_ahead(
-            values,
-            theta,
-            parameters,
-            features=names_in(posterior, "feature"),
-            n_robots=posterior.attrs["n_robots"],
-            n_missions=posterior.attrs["n_missions"],
-            is_drawn=is_drawn,
-        )
-        found.append(({**parameters, **robots}, maps | of_robots if is_drawn else maps))
-    return found
+    ahead = _Ahead(theta, parameters, names, names_in(posterior, "feature"))
+    return ahead.with_effects(places, values, posterior.attrs["n_missions"], next_mission)
 
 
 def _effects_of_robots(effects: Sequence[Effect]) -> list[Effect]:
@@ -231,60 +211,80 @@ def _effects_of_robots(effects: Sequence[Effect]) -> list[Effect]:
     return [effect for effect in effects if not isinstance(effect, PlaceEffect)]
 
 
-def _robot_effects_ahead(
-    values: Mapping[Effect, Mapping[str, np.ndarray]],
-    theta: Theta,
-    parameters: Mapping[str, np.ndarray],
-    *,
-    features: Sequence[str],
-    n_robots: int,
-    n_missions: int,
-    is_drawn: bool,
-) -> dict[str, np.ndarray]:
-    """Return the parameters (draw, robot, ...) that the robot effects of the next mission change.
+class _Ahead(NamedTuple):
+    """Parameters (draw, ...) of the next mission by name, before its effects are added."""
 
-    `values` contains the variables of each effect in the `n_missions` missions so far. If
-    `is_drawn`, the effects of the next mission are drawn at random; otherwise, their expected
-    values are used.
-    """
-    if not values:
-        return {}
+    theta: Theta
+    parameters: Mapping[str, np.ndarray]
+    robots: Sequence[str]
+    features: Sequence[str]
 
-    rng = np.random.default_rng(_NEXT_MISSION_SEED) if is_drawn else None
-    n_draws = len(theta["inverse_gain"])
-    slopes = [effect.predict_next(v, theta, n_missions, rng) for effect, v in values.items()]
-    slope = np.broadcast_to(sum(slopes), (n_draws, n_robots))
+    def with_effects(
+        self,
+        places: xr.Dataset | None,
+        values: Mapping[Effect, Mapping[str, np.ndarray]],
+        n_missions: int,
+        next_mission: Sequence[bool],
+    ) -> list[tuple[dict[str, np.ndarray], dict[str, Any]]]:
+        """Add the effects of places and robots; see the function `with_effects`.
 
-    # Robot effects act on line of sight, or on the intercept if it is not among the features.
-    sight = [m for m, name in enumerate(features) if is_line_of_sight(name)]
-    weights = np.zeros((n_draws, n_robots, len(features)))
-    if sight:
-        weights[:, :, sight] = slope[..., None] / len(sight)
-        slope = np.zeros((n_draws, n_robots))
+        `values` contains the variables of each effect of robots in the `n_missions` missions so
+        far.
+        """
+        maps: dict[str, Any] = {}
+        of_robots: dict[str, Any] = {}
+        if places is not None:
+            maps |= place_maps_of(places, self.parameters)
+            if any(next_mission):
+                in_bounds = robots_in_bounds_of(places, self.parameters, self.robots)
+                of_robots["place_robot"] = in_bounds
 
-    b = parameters["b"].reshape(n_draws, -1) + slope
-    if "B0" in parameters:
-        B = parameters["B"].copy()
-        robot = np.arange(n_robots)
-        B[:, :, robot, robot] += np.swapaxes(weights, 1, 2)
-        return {"b": b, "B": B}
-    beta = parameters["beta"] if parameters["beta"].ndim == 3 else parameters["beta"][:, None]
-    return {"b": b, "beta": beta + weights}
+        found = []
+        for is_drawn in next_mission:
+            changed = self._of_robots(values, n_missions, is_drawn)
+            found.append(({**self.parameters, **changed}, maps | of_robots if is_drawn else maps))
+        return found
+
+    def _of_robots(
+        self,
+        values: Mapping[Effect, Mapping[str, np.ndarray]],
+        n_missions: int,
+        is_drawn: bool,
+    ) -> dict[str, np.ndarray]:
+        """Return the parameters (draw, robot, ...) that the robot effects change.
+
+        If `is_drawn`, the effects are drawn at random; otherwise, their expected values are used.
+        """
+        if not values:
+            return {}
+
+        rng = np.random.default_rng(_NEXT_MISSION_SEED) if is_drawn else None
+        shape = len(self.theta["inverse_gain"]), len(self.robots)
+        slopes = [
+            effect.predict_next(v, self.theta, n_missions, rng) for effect, v in values.items()
+        ]
+        slope = np.broadcast_to(sum(slopes), shape)
+
+        # Robot effects act on line of sight, or on the intercept if it is not among the features.
+        sight = [m for m, name in enumerate(self.features) if is_line_of_sight(name)]
+        weights = np.zeros((*shape, len(self.features)))
+        if sight:
+            weights[:, :, sight] = slope[..., None] / len(sight)
+            slope = np.zeros(shape)
+
+        b = self.parameters["b"].reshape(shape[0], -1) + slope
+        if "B0" in self.parameters:
+            B = self.parameters["B"].copy()
+            robot = np.arange(shape[1])
+            B[:, :, robot, robot] += np.swapaxes(weights, 1, 2)
+            return {"b": b, "B": B}
+        beta = self.parameters["beta"]
+        return {"b": b, "beta": (beta if beta.ndim == 3 else beta[:, None]) + weights}
 
 
 def names_in(posterior: xr.DataTree, axis: str) -> tuple[str, ...]:
-    """Return the names of the robots or features of a posterior, in the order of the fit.
-
-    Posteriors of earlier versions do not record them; the order is then that of their arrays, or
-    the result is empty.
-    """
-    if f"{axis}s" in posterior.attrs:  # a file stores a single name as a text
-        return tuple(np.atleast_1d(posterior.attrs[f"{axis}s"]).tolist())
-
-    for group in ("posterior", "robots", "constant_data"):
-        if group in posterior.children and axis in posterior[group].coords:
-            return tuple(str(name) for name in posterior[group].coords[axis].values)
-    return ()
+    """Return the names of the robots or features of a posterior, in the order of the fit."""
+    return tuple(np.atleast_1d(posterior.attrs[f"{axis}s"]).tolist())  # a file has one as a text
 
 
 def in_order_of(
@@ -339,7 +339,7 @@ def _in_order(
     names: dict[str, Sequence[Any] | None] = dict.fromkeys(_NUMBERED)
     dims: dict[str, list[str]] = {}
     if is_by_position(posterior):
-        dims = json.loads(posterior["posterior"].attrs.get("dims", "{}"))
+        dims = json.loads(posterior["posterior"].attrs["dims"])
         for dim in {dim for of_variable in dims.values() for dim in of_variable}:
             names |= _names_along(posterior, dim, robots, features)
     for effect in effects_of(posterior):
@@ -350,23 +350,14 @@ def _in_order(
             names[axis] = of_axis
             names[f"{axis}_"] = of_axis  # second axis of a matrix, or of means over robots
 
-    changed = {}
+    groups = {}
     for name, group in posterior.children.items():
-        given = group.to_dataset()
-        ordered = in_order("the posterior", given, names)
+        ordered = in_order("the posterior", group.to_dataset(), names)
         if name == "places":
             ordered = in_order_of_places(ordered)
-        of_variables = dims if name in _OF_VARIABLES else {}
-        ordered = _transposed(ordered, of_variables)
-        if ordered is not given:
-            changed[name] = ordered
+        groups[name] = _transposed(ordered, dims if name in _OF_VARIABLES else {})
 
-    same_robots = tuple(robots) == names_in(posterior, "robot")
-    if not changed and same_robots and tuple(features) == names_in(posterior, "feature"):
-        return posterior
-
-    groups = {name: group.to_dataset() for name, group in posterior.children.items()}
-    whole = xr.DataTree.from_dict(groups | changed)
+    whole = xr.DataTree.from_dict(groups)
     whole.attrs = posterior.attrs | {"robots": list(robots), "features": list(features)}
     return whole
 
@@ -404,7 +395,7 @@ def _transposed(group: xr.Dataset, dims: Mapping[str, Sequence[str]]) -> xr.Data
             axes = ("chain", "draw", *dims[str(name)])
         if axes != array.dims and set(axes) == set(array.dims):
             turned[name] = array.transpose(*axes)
-    return group.assign(turned) if turned else group
+    return group.assign(turned)
 
 
 def _position(axis: Hashable) -> int:
@@ -419,8 +410,8 @@ def _without_robots(posterior: xr.DataTree, others: Sequence[str]) -> xr.DataTre
         axes = [axis for axis in ("robot", "robot_") if axis in group.indexes]
         return group.drop_sel({axis: list(others) for axis in axes})
 
-    kept = xr.DataTree.from_dict({n: drop(g.to_dataset()) for n, g in posterior.children.items()})
-    kept.attrs = posterior.attrs | {
+    kept = posterior.map_over_datasets(drop)
+    kept.attrs |= {
         "n_robots": posterior.attrs["n_robots"] - len(others),
         "robots": [name for name in names_in(posterior, "robot") if name not in others],
     }
@@ -526,13 +517,9 @@ def sample_prior(
         >>> draws = tb.inference.sample_prior(model, n_features=3, n_draws=500, seed=0)
         >>> planner.plan(draws).bands.shape  # (quantile, bound, robot)
     """
-    remedy = "give a model such as PooledTrust()"
-    if callable(model) and not isinstance(model, type | TrustModel):
-        remedy = (
-            "draw from a NumPyro function with numpyro.infer.Predictive(model, "
-            "num_samples=500)(jax.random.key(0), awareness), where awareness has the shape "
-            "(mission, bound, robot, feature)"
-        )
+    remedy = (
+        "give a model such as PooledTrust(); for a NumPyro function, use numpyro.infer.Predictive"
+    )
     require_kind("model", model, TrustModel, remedy)
     n_draws = require_count("n_draws", n_draws)
     seed = require_whole("seed", seed, 0)
@@ -577,33 +564,23 @@ def with_prior_effects_ahead(
 
     `theta` and `parameters` contain draws (draw, ...) from the prior by name.
     """
-    n_robots = workspace.team.n_robots
+    robots = workspace.team.names
     n_draws = len(theta["inverse_gain"])
-    maps: dict[str, Any] = {}
+    group = None
     if any(isinstance(effect, PlaceEffect) for effect in effects):
         nowhere = {
             "place": np.zeros((1, n_draws, 0)),
             "place_bound": np.zeros((1, n_draws, 0)),
-            "place_robot": np.zeros((1, n_draws, 0, n_robots)),
+            "place_robot": np.zeros((1, n_draws, 0, len(robots))),
         }
-        rows, cols = workspace.passable.shape
-        places = visited(np.full((1, 1, 3), -1), (rows, cols))
-        robots = workspace.team.names
+        places = visited(np.full((1, 1, 3), -1), workspace.grid.shape)
         group = place_group(nowhere, places, robots, seed)
-        maps = place_maps_of(group, parameters)
-        maps["place_robot"] = robots_in_bounds_of(group, parameters, robots)
 
-    never = {"robot_effect": np.zeros((n_draws, 0, n_robots))}
-    robots = _robot_effects_ahead(
-        dict.fromkeys(_effects_of_robots(effects), never),
-        theta,
-        parameters,
-        features=workspace.features,
-        n_robots=n_robots,
-        n_missions=0,
-        is_drawn=True,
-    )
-    return {**parameters, **robots}, maps
+    never = {"robot_effect": np.zeros((n_draws, 0, len(robots)))}
+    values = dict.fromkeys(_effects_of_robots(effects), never)
+    ahead = _Ahead(theta, parameters, robots, workspace.features)
+    [found] = ahead.with_effects(group, values, 0, [True])
+    return found
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:

@@ -17,6 +17,7 @@ import xarray as xr
 from scipy import fft
 from scipy.linalg import cho_factor, cho_solve
 
+from trustbo.arrays import joined_draws
 from trustbo.models.effects.place import matern
 from trustbo.models.robots_in_bounds import RobotsInBounds
 from trustbo.models.visited import Visited
@@ -87,7 +88,7 @@ def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> di
     rows, cols = (int(n) for n in group.attrs["shape"])
     seed = int(group.attrs["seed"])
 
-    s = _by_draw(group, "place", "cell")
+    s = joined_draws(group["place"], ["cell"])
     cells = np.column_stack([group[f"cell_{name}"].values for name in _CELL])
     place = _cells(s, cells, (rows, cols), parameters, [seed, 0])
 
@@ -96,7 +97,7 @@ def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> di
     place_bound = rng.standard_normal((len(place), len(MOVE_NAMES), rows, cols))
     place_bound *= parameters["tau_e"][:, None, None, None]
     _centre(place_bound)
-    place_bound[:, *_bounds(group)] = _by_draw(group, "place_bound", "bound")
+    place_bound[:, *_bounds(group)] = joined_draws(group["place_bound"], ["bound"])
     return {"place": place[:, None], "place_bound": place_bound[:, None]}
 
 
@@ -118,11 +119,8 @@ def robots_in_bounds_of(
     column = np.full((len(MOVE_NAMES), rows, cols), -1)
     known = np.zeros((len(tau_r), len(robots), 0))
     if set(robots) <= set(group["robot"].values.tolist()):
-        n_bounds = group.sizes["bound"]
-        column[*_bounds(group)] = np.arange(n_bounds)
-        known = group["place_robot"].astype(float)
-        known = known.sel(robot=list(robots)).transpose("chain", "draw", "robot", "bound")
-        known = known.values.reshape(len(tau_r), len(robots), n_bounds)
+        column[*_bounds(group)] = np.arange(group.sizes["bound"])
+        known = joined_draws(group["place_robot"].sel(robot=list(robots)), ["robot", "bound"])
 
     seed = int(group.attrs["seed"])
     return RobotsInBounds(known, column, tau_r, np.arange(len(tau_r)), seed)
@@ -151,14 +149,6 @@ def of_workspace(group: xr.Dataset) -> xr.Dataset:
 def _bounds(group: xr.Dataset) -> tuple[np.ndarray, ...]:
     """Return the moves, rows and columns of the visited bounds."""
     return tuple(group[f"bound_{name}"].values for name in _BOUND)
-
-
-def _by_draw(group: xr.Dataset, name: str, axis: str) -> np.ndarray:
-    """Return the effects (draw, place) of a variable with chains joined."""
-    ordered = group[name].transpose("chain", "draw", ...)
-    n_draws = ordered.sizes["chain"] * ordered.sizes["draw"]
-    values = ordered.values.astype(float)  # stored in single precision
-    return values.reshape(n_draws, group.sizes[axis])  # also for 0 places
 
 
 def _cells(

@@ -15,6 +15,8 @@ from trustbo.inference.draws import (
     in_order_of,
     joined_draws,
     names_in,
+    require_no_nan,
+    require_variables,
     values_of,
     with_effects,
     with_prior_effects_ahead,
@@ -335,20 +337,9 @@ def draws_of_function(
 
     draws = posterior["posterior"].to_dataset()
     names = json.loads(draws.attrs["common"])
-    missing = [name for name in names if safe(name) not in draws]
-    if missing:
-        raise TrustboError(
-            f"the posterior has no variable {missing[0]!r}, only {', '.join(map(str, draws))}. "
-            "Give a posterior from trustbo.fit with unchanged names."
-        )
-
+    require_variables(map(safe, names), draws)
     values = {name: joined_draws(draws[safe(name)]) for name in names}
-    bad = [name for name, array in values.items() if np.isnan(array).any()]
-    if bad:
-        raise TrustboError(
-            f"draws of {bad[0]!r} are NaN; drop these draws with posterior.isel(draw=...) instead "
-            "of masking them."
-        )
+    require_no_nan(values)
     resolution = float(posterior.attrs["resolution"])
     drift = function_drift(model, values, robots, features, shape)
     effects = effects_of(posterior)
