@@ -90,7 +90,7 @@ def facts_of(result: Result) -> dict[str, str]:
     """Return the facts, by name, that are needed to decide whether to drive the path."""
     plan = result.plan
     bounds = bounds_of(result).iloc[1:]
-    rate = result.state.entries[-1].measures["contact_rate"]
+    rate = float(result.history["contact_rate"][-1])
     last = f"{rate:.1%} of the time" if np.isfinite(rate) else "not measured"
     cells = " → ".join(bounds_of(result)["cell"])
     facts = {
@@ -232,9 +232,9 @@ def _tables(result: Result) -> dict[str, str]:
         missions = missions.rename(columns={"objective": "predicted_lost"})
     missions.columns = missions.columns.str.replace("_", " ")
 
-    last = result.state.row(len(result.state.entries) - 1)
+    last = result.history.isel(iteration=-1)
     diagnostics = {
-        name: last[column]
+        name: float(last[column])
         for column, name in _DIAGNOSTICS.items()
         if column in last and np.isfinite(last[column])
     }
