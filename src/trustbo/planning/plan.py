@@ -287,19 +287,15 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
     """Restore a plan of a workspace from a record made by `plan_to_record`."""
-    values: dict[str, Any] = {**record, "workspace": workspace}
-    for name in ("trust", "bands"):
-        values[name] = np.array(record[name])
-
-    if record["value_band"]:
-        values["value_band"] = tuple(record["value_band"])
-    if record["risk"]:
-        values["risk"] = PathRisk.from_record(record["risk"])
-
-    values["blocked"] = tuple(((a, b), (c, d)) for (a, b), (c, d) in record["blocked"])
+    values = {name: _as_tuples(value) for name, value in record.items()}
+    values |= {name: np.array(record[name]) for name in ("trust", "bands")}
+    values["risk"] = record["risk"] and PathRisk.from_record(record["risk"])
     values["past_failures"] = tuple(
-        PastFailure(bound, mission, status, tuple((row, col) for row, col in way), p_fail)
-        for bound, mission, status, way, p_fail in record.get("past_failures", ())
+        PastFailure(*failure) for failure in values.get("past_failures", ())
     )
-    values["path"] = tuple((row, col) for row, col in record["path"])
-    return Plan(**values)
+    return Plan(**values, workspace=workspace)
+
+
+def _as_tuples(value: Any) -> Any:
+    """Convert lists, also within lists, to tuples."""
+    return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
