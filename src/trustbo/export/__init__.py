@@ -45,20 +45,20 @@ def export_result(
         >>> [file.name for file in files]
         ['maps.tif', 'nav2']
     """
-    is_plan = isinstance(result, Plan)
+    possible = _OF_PLANS if isinstance(result, Plan) else tuple(WRITERS)
     if formats is None:
-        formats = [name for name in _DEFAULT if name in _OF_PLANS or not is_plan]
+        formats = [name for name in _DEFAULT if name in possible]
     names = [
         require_choice("format", name, WRITERS)
         for name in require_list("formats", formats, remedy=f"give some of {', '.join(WRITERS)}")
     ]
 
-    of_results = [name for name in names if name not in _OF_PLANS]
-    if is_plan and of_results:
-        raise TrustboError(
-            f"the format {of_results[0]!r} needs a result or a campaign; a plan can be written as "
-            f"{' and '.join(_OF_PLANS)}."
-        )
+    for name in names:
+        if name not in possible:
+            raise TrustboError(
+                f"the format {name!r} needs a result or a campaign; a plan can be written as "
+                f"{' and '.join(_OF_PLANS)}."
+            )
 
     written = []
     for name in names:
