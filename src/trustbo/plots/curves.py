@@ -113,14 +113,13 @@ def _latent_trust(
     latent = posterior["latent"].to_dataset()
     n = latent.sizes["mission"]
     mission = require_whole("mission", mission, -n, n - 1)
-    trust = latent["trust"].isel(mission=mission).stack(all_draws=("chain", "draw"))
-    trust = trust.dropna("bound", how="all").transpose("all_draws", "bound", "robot")
-
+    trust = latent["trust"].isel(mission=mission).dropna("bound", how="all")
+    trust = trust.transpose("chain", "draw", "bound", "robot")
     rates = posterior["observed_data"]["contact_rate"].isel(mission=mission)
     rates = rates.sel(bound=trust["bound"]).transpose("bound", "robot").values
 
-    middle = np.median(trust.values, 0)
-    bands = np.quantile(trust.values, QUANTILES, axis=0)
+    middle = np.median(trust, (0, 1))
+    bands = np.quantile(trust, QUANTILES, axis=(0, 1))
     return trust["bound"].values, middle, bands, rates, trust["robot"].values.tolist()
 
 

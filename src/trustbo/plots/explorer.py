@@ -245,7 +245,7 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
         plot.line(**path, color=colour, line_width=width, legend_label="recommended")
     for k, marker in ((0, "circle"), (-1, "star")):
         look = {"marker": marker, "size": 14, "color": "white", "line_color": "black"}
-        plot.scatter(path["x"][k], path["y"][k], **look)
+        plot.scatter([path["x"][k]], [path["y"][k]], **look)
 
     if plan.posts is None or plan.routes is None:
         return
@@ -272,17 +272,16 @@ def _text(mission: xr.Dataset, objective: str) -> str:
     value = float(mission["objective"])
     predicted = f"predicted objective {value:z.3f}"
     if objective == "lost_contact":
-        lost = _measured(mission, "contact_lost", 2)
+        lost = _measured(mission["contact_lost"], ".2f")
         predicted = f"contact lost {lost}, predicted {-value:z.2f} bounds"
     return (
         f"<b>Mission {int(mission['iteration'])}</b>: {escape(str(mission['status'].item()))}, "
-        f"contact rate {_measured(mission, 'contact_rate', 3)}, "
+        f"contact rate {_measured(mission['contact_rate'], '.3f')}, "
         f"plan of {len(cells_of(mission['path'].values)) - 1} bounds, "
         f"{predicted}"
     )
 
 
-def _measured(mission: xr.Dataset, name: str, n_decimals: int) -> str:
-    """Return a quantity of a mission as text."""
-    value = float(mission[name]) if name in mission else np.nan
-    return f"{value:z.{n_decimals}f}" if np.isfinite(value) else "not measured"
+def _measured(value: xr.DataArray, style: str) -> str:
+    """Return a quantity of a mission as text, formatted in a style such as ".2f"."""
+    return format(value.item(), f"z{style}") if np.isfinite(value) else "not measured"

@@ -129,11 +129,7 @@ def trust_maps(
         chosen = [i for i in MOMENTS if i <= n_missions]
     else:
         given = require_list("missions", missions, remedy="give numbers of missions, such as [1]")
-        chosen = [require_whole("mission", i, 1) for i in given]
-    if chosen and max(chosen) > n_missions:
-        raise TrustboError(
-            f"missions has {max(chosen)}, but the last mission is {n_missions}; leave it out."
-        )
+        chosen = [require_whole("mission", i, 1, n_missions) for i in given]
 
     planned = history.transpose("iteration", ...).sel(iteration=chosen)
     maps = np.stack(
@@ -373,8 +369,8 @@ def draw_path(ax: Axes, path: Sequence[Cell] | np.ndarray, grid: Grid) -> None:
 
 def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
     """Return axes for n maps, in metres from the lower left corner; the first has a scale bar."""
-    left, right, bottom, top = extent_of(grid)
-    tall = float(np.clip((top - bottom) / (right - left), 0.3, 3.0))
+    _, right, _, top = extent_of(grid)
+    tall = float(np.clip(top / right, 0.3, 3.0))
     width = 3.0 if n > 1 else 4.0
     columns = 2 if n == 4 else 3
 
@@ -382,15 +378,20 @@ def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
     axes = panels(n, ax, (width, inner * tall + 0.4), columns=columns)
 
     for panel in axes:
-        panel.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
-        panel.spines[:].set_visible(True)
-        panel.grid(visible=False)  # its lines would look like edges of cells
+        set_frame(panel, grid, xlabel="east (m)", ylabel="north (m)")
         panel.locator_params(nbins=4)
-        panel.set(xlabel="east (m)", ylabel="north (m)")
         if panel.get_subplotspec() is not None:
             panel.label_outer()
     draw_scale(axes[0])
     return axes
+
+
+def set_frame(ax: Axes, grid: Grid, **settings: Any) -> None:
+    """Show the area of a grid in axes with a frame; `settings` are those of `Axes.set`."""
+    extent = extent_of(grid)
+    ax.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", **settings)
+    ax.spines[:].set_visible(True)
+    ax.grid(visible=False)  # its lines would look like edges of cells
 
 
 def colour_bar(

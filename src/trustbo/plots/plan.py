@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 
 from trustbo.errors import TrustboError, require_kind, require_list, require_whole
 from trustbo.planning import Plan
-from trustbo.plots.maps import draw_contours, draw_path, draw_scale, extent_of
+from trustbo.plots.maps import draw_contours, draw_path, draw_scale, extent_of, set_frame
 from trustbo.plots.style import (
     GREY,
     add_legend,
@@ -95,13 +95,9 @@ def _draw_ground(ax: Axes, workspace: Workspace) -> None:
     """Draw vegetation and contour lines."""
     terrain = workspace.terrain
     assert terrain is not None  # noqa: S101
-    extent = extent_of(workspace.grid)
-    ax.set(xlim=extent[:2], ylim=extent[2:], aspect="equal", xticks=[], yticks=[])
-    ax.spines[:].set_visible(True)
-    ax.grid(visible=False)  # its lines would look like edges of cells
-
+    set_frame(ax, workspace.grid, xticks=[], yticks=[])
     grown = np.where((terrain["dsm"] - terrain["dem"]).values > _GROWN, 1.0, np.nan)
-    ax.imshow(grown, cmap=ListedColormap([_VEGETATION]), extent=extent)
+    ax.imshow(grown, cmap=ListedColormap([_VEGETATION]), extent=extent_of(workspace.grid))
     draw_contours(ax, workspace, GREY, 0.8)
 
 
