@@ -21,13 +21,15 @@ from matplotlib.ticker import MaxNLocator
 
 import trustbo as tb
 from trustbo.plots.maps import (
+    BRIGHT_HIGH,
     draw_cells,
-    draw_ground,
     draw_path,
     draw_scale,
     hatch_undriven,
-    robust_limits,
+    limits_of,
+    shown_values,
 )
+from trustbo.plots.plan import draw_ground
 from trustbo.plots.style import GREY, ROBOTS, outlined
 
 START, GOAL, MISSIONS = (9, 0), (0, 9), 8
@@ -144,7 +146,7 @@ def draw_bound(ax: Axes, plan: tb.planning.Plan) -> None:
         "T2 watches": sight[0], "2. T2 closes up": follows,
     }  # fmt: skip
     ax.legend(legend.values(), legend.keys(), loc="lower left", fontsize=8)
-    draw_scale(ax, plan.workspace.grid)
+    draw_scale(ax)
 
 
 def draw_trust(
@@ -155,7 +157,7 @@ def draw_trust(
     maps = [result.history["trust_map"].sel(iteration=1), result.trust_map]
     for values in maps:
         values[START] = np.nan  # the trust at the start is assumed
-    low, _ = robust_limits(np.stack(maps))
+    low, _ = limits_of(np.stack(maps), is_trust=True)
     driven = np.zeros((2, *workspace.grid.shape), dtype=bool)
     for mission in result.missions:
         for bound in mission.bounds:
@@ -165,14 +167,15 @@ def draw_trust(
     titles = ["(c) trust by the old map, first path", f"(d) after {MISSIONS} missions, new path"]
     x, y = np.array(center) - workspace.grid.corner
     for ax, values, known, path, title in zip(axes, maps, driven, paths, titles, strict=True):
-        image = draw_cells(ax, values, workspace, norm)
+        shown = shown_values(values, workspace)
+        image = draw_cells(ax, shown, workspace, norm, BRIGHT_HIGH)
         hatch_undriven(ax, known, workspace)
         draw_path(ax, path, workspace.grid)
         circle = Circle((x, y), RADIUS, fill=False, color="white", linestyle="--", linewidth=1.3)
         circle.set_path_effects(outlined(2.6, "black"))
         ax.add_patch(circle)
         ax.set(xticks=[], yticks=[], title=title)
-        draw_scale(ax, workspace.grid)
+        draw_scale(ax)
     bar = figure.colorbar(image, ax=axes, extend="both", shrink=0.9)
     bar.set_label("expected trust (1: unbroken contact)\nhatched: never entered, only predicted")
 

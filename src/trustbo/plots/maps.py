@@ -145,8 +145,7 @@ def trust_maps(
     for panel, values, cells, n in zip(axes, maps, paths, learned, strict=True):
         draw_cells(panel, values, workspace, norm, BRIGHT_HIGH)
         if driven is not None:
-            new = workspace.passable.values & ~np.asarray(driven)[n]
-            _hatch(panel, *edges_of(workspace.grid), new, "none", **_HATCH)
+            hatch_undriven(panel, np.asarray(driven)[n], workspace)
         draw_path(panel, cells, workspace.grid)
 
         # In two lines if the panel is narrow.
@@ -453,6 +452,12 @@ def shown_values(values: xr.DataArray, workspace: Workspace) -> np.ndarray:
         row, col = values.attrs["start"].split(",")
         shown[int(row), int(col)] = np.nan
     return shown
+
+
+def hatch_undriven(ax: Axes, driven: np.ndarray, workspace: Workspace) -> None:
+    """Hatch the passable cells that were not `driven`, shape (row, col)."""
+    new = workspace.passable.values & ~driven
+    _hatch(ax, *edges_of(workspace.grid), new, "none", **_HATCH)
 
 
 def _hatch(

@@ -71,7 +71,7 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     size = (2.5, 2.6) if len(shown) else (5.0, 4.4)  # in inches
     axes = panels(1 + len(shown), ax, size)
     for panel in axes:
-        _draw_ground(panel, plan.workspace)
+        draw_ground(panel, plan.workspace)
     draw_path(axes[0], plan.path, plan.workspace.grid)
     axes[0].set_title(f"path of {n_bounds} bounds")
     draw_scale(axes[0])
@@ -91,7 +91,7 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     return axes
 
 
-def _draw_ground(ax: Axes, workspace: Workspace) -> None:
+def draw_ground(ax: Axes, workspace: Workspace) -> None:
     """Draw vegetation and contour lines."""
     terrain = workspace.terrain
     assert terrain is not None  # noqa: S101
