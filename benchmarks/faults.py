@@ -118,7 +118,7 @@ FAULTS = (
     Fault("a rate that was not measured counts as 0", "inference/engine.py",
           "seen = ~np.isnan(y)", "seen = np.ones(np.shape(y), dtype=bool)"),
     Fault("frames are rotated the other way", "export/nav2.py",
-          "np.array([[c, s], [-s, c]])", "np.array([[c, -s], [s, c]])"),
+          "np.array([[c, -s], [s, c]])", "np.array([[c, s], [-s, c]])"),
 )  # fmt: skip
 
 
