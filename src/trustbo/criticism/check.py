@@ -38,6 +38,7 @@ _TOLERANCE = 0.05
 """Tolerated error of the coverage of these intervals."""
 _ERRORS = 2.0
 """Number of standard errors above which a difference is significant."""
+_OF_DRAWS = ("chain", "draw")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -151,71 +152,65 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     if "robots" not in posterior.children:
         return pd.DataFrame()
     group = posterior["robots"].to_dataset()
-    draws = joined_draws(group["robot_effect"]) + _in_all_bounds(posterior, group["robot"].values)
+    effect = group["robot_effect"].astype(float) + _in_all_bounds(posterior)
 
-    if draws.shape[2] == _PAIR:
+    if effect.sizes["robot"] == _PAIR:
         # The median would lie halfway between the two robots, and neither would stand out.
-        draws = draws - draws[:, :, ::-1]
+        effect = effect - effect.roll(robot=1)
     else:
         # The weight of line of sight already includes the part that all robots and missions share.
-        draws = draws - np.median(draws, axis=(1, 2), keepdims=True)
-    draws = draws / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
+        effect = effect - effect.median(("mission", "robot"))
+    effect = effect / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
 
     # Missions of earlier campaigns, which have negative indices, only serve as a reference.
-    own = group["mission"].values >= 0
-    draws = draws[:, own]
+    effect = effect.isel(mission=effect["mission"] >= 0)
 
-    probability = np.maximum((draws < -SIZE).mean(0), (draws > SIZE).mean(0))
-    columns = {"effect": draws.mean(0), "sd": draws.std(0), "probability": probability}
-    columns["stands_out"] = probability > SURE
+    less = (effect < -SIZE).mean(_OF_DRAWS)
+    more = (effect > SIZE).mean(_OF_DRAWS)
+    columns = {"effect": effect.mean(_OF_DRAWS), "sd": effect.std(_OF_DRAWS)}
+    columns["probability"] = less.where(less > more, more)
+    table = xr.Dataset(columns).to_dataframe(["mission", "robot"]).reset_index()
+    table["mission"] += 1
+    return table.assign(stands_out=table["probability"] > SURE)
 
-    labels = group["mission"].values[own] + 1, group["robot"].values
-    index = pd.MultiIndex.from_product(labels, names=("mission", "robot"))
-    return pd.DataFrame({n: v.ravel() for n, v in columns.items()}, index).reset_index()
 
-
-def _in_all_bounds(posterior: xr.DataTree, robots: np.ndarray) -> np.ndarray:
-    """Return the mean effect of each robot in the visited bounds, (draw, 1, robot), or 0.
+def _in_all_bounds(posterior: xr.DataTree) -> xr.DataArray | float:
+    """Return the mean effect of each robot in the visited bounds, (chain, draw, robot), or 0.
 
     If all missions take the same path, a robot that is poor everywhere cannot be distinguished from
     bounds that are all bad for this robot. Its mean effect in these bounds therefore counts as an
     effect of the robot.
     """
     if "places" not in posterior.children:
-        return np.zeros(1)
+        return 0.0
 
     places = of_workspace(posterior["places"].to_dataset())
     if "place_robot" not in places or not places.sizes["bound"]:
-        return np.zeros(1)
-    in_bounds = joined_draws(places["place_robot"].sel(robot=robots).mean("bound", dtype=float))
-    return in_bounds[:, None]
+        return 0.0
+    return places["place_robot"].astype(float).mean("bound")
 
 
 def _check_robots(robots: pd.DataFrame) -> Finding:
     """Check whether the effect of a robot in a mission differs from the median."""
-    if not len(robots):
+    if robots.empty:
         return Finding("not tested: the model has no robot effects")
-    effect = robots["effect"].to_numpy()
-    odd = robots["stands_out"].to_numpy()
-    if not odd.any():
-        return Finding("no robot stands out", size=float(np.abs(effect).max()))
-
-    mission = robots["mission"].to_numpy()
-    robot = robots["robot"].to_numpy()
+    odd = robots.loc[robots["stands_out"]]
+    if odd.empty:
+        return Finding("no robot stands out", size=robots["effect"].abs().to_numpy().max())
 
     # If there are two robots, both stand out. One sentence about the robot with less contact is
     # enough.
-    names = list(dict.fromkeys(robot))
-    shown = odd & (effect < 0.0) if len(names) == _PAIR else odd
+    names = robots["robot"].unique().tolist()
+    if len(names) == _PAIR:
+        odd = odd.loc[odd["effect"] < 0.0]
 
     words = []
-    for name in dict.fromkeys(robot[shown]):
-        rows = shown & (robot == name)
-        if rows.sum() == (robot == name).sum():
+    for name, rows in odd.groupby("robot", sort=False):
+        if len(rows) == (robots["robot"] == name).sum():
             when = "all missions"
         else:
-            when = f"mission {joined(mission[rows].astype(str).tolist())}"
-        size = effect[rows].mean()
+            when = f"mission {joined(rows['mission'].astype(str).tolist())}"
+        size = rows["effect"].mean()
         if len(names) == _PAIR:
             [other] = (each for each in names if each != name)
             what = f"{name}: {-size:.2f} less contact at full line of sight than {other}"
@@ -223,10 +218,8 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
             what = f"{name}: {size:+.2f} contact at full line of sight"
         words.append(f"{what} in {when}")
 
-    most = int(np.argmax(np.where(shown, np.abs(effect), 0.0)))
-    size = float(effect[most])
-    p = float(robots["probability"].to_numpy()[most])
-    return Finding(joined(words), True, str(robot[most]), size, p)
+    most = odd.loc[odd["effect"].abs().idxmax()]
+    return Finding(joined(words), True, most["robot"], most["effect"], most["probability"])
 
 
 def _check_places(posterior: xr.DataTree) -> Finding:
@@ -236,9 +229,10 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     places = of_workspace(posterior["places"].to_dataset())
     if not places.sizes["bound"]:
         return Finding("not tested: no place of the workspace was visited")
-    cells = list(zip(places["cell_row"].values, places["cell_col"].values, strict=True))
-    where = list(zip(places["bound_row"].values, places["bound_col"].values, strict=True))
-    of_cells = joined_draws(places["place"])[:, [cells.index(cell) for cell in where]]
+
+    cells = pd.MultiIndex.from_arrays([places["cell_row"].values, places["cell_col"].values])
+    where = pd.MultiIndex.from_arrays([places["bound_row"].values, places["bound_col"].values])
+    of_cells = joined_draws(places["place"])[:, cells.get_indexer(where)]
     total = joined_draws(places["place_bound"]) + of_cells
     inverse_gain = theta_of(posterior, parameters_of(posterior))["inverse_gain"]
     per_drift = inverse_gain.reshape(len(total), -1).mean(1, keepdims=True)
@@ -249,17 +243,15 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     # any place stand out.
     draws = draws - np.median(draws, axis=1, keepdims=True)
 
-    effect = draws.mean(0)
-    sure = (draws * np.sign(effect) > 0.0).mean(0)
-    odd = (sure > SURE) & (np.abs(effect) > SIZE)
-    among = odd if odd.any() else np.ones(len(odd), bool)
-    most = int(np.argmax(np.where(among, np.abs(effect), 0.0)))
-    row, col = (int(i) for i in where[most])
+    table = pd.DataFrame({"effect": draws.mean(0), "place": where.map("({0[0]}, {0[1]})".format)})
+    table["sure"] = (draws * np.sign(draws.mean(0)) > 0.0).mean(0)
+    odd = table.loc[(table["sure"] > SURE) & (table["effect"].abs() > SIZE)]
+    among = table if odd.empty else odd
+    most = among.loc[among["effect"].abs().idxmax()]
 
-    words = f"{odd.sum()} of {len(odd)} places stand out; the largest effect is {effect[most]:+.2f}"
-    size = float(effect[most])
-    p = float(sure[most])
-    return Finding(words, bool(odd.any()), f"({row}, {col})", size, p)
+    size = most["effect"]
+    words = f"{len(odd)} of {len(table)} places stand out; the largest effect is {size:+.2f}"
+    return Finding(words, not odd.empty, most["place"], size, most["sure"])
 
 
 def _check_weights(posterior: xr.DataTree) -> Finding:
@@ -308,11 +300,12 @@ def _check_coverage(
 
     pit = score(trees, missions)["pit"]
     is_inside = (abs(pit - 0.5) <= 0.5 * _COVERAGE).where(pit.notnull())
-    within = is_inside.mean(("bound", "robot")).values
-    within = within[np.isfinite(within)]
-    if not len(within):
+    within = is_inside.mean(("bound", "robot")).dropna("mission")
+    if not within.size:
         return Finding("not tested: no rate of the predicted missions was measured")
-    off = float(within.mean() - _COVERAGE)
-    error = within.std(ddof=1) / np.sqrt(len(within)) if len(within) > 1 else np.inf
-    words = f"90 % intervals one mission ahead contain {within.mean():.0%} of the rates"
-    return Finding(words, bool(abs(off) > max(_TOLERANCE, _ERRORS * error)), "90 %", off)
+
+    share = float(within.mean())
+    error = float(within.std(ddof=1)) / np.sqrt(within.size) if within.size > 1 else np.inf
+    is_off = abs(share - _COVERAGE) > max(_TOLERANCE, _ERRORS * error)
+    words = f"90 % intervals one mission ahead contain {share:.0%} of the rates"
+    return Finding(words, is_off, "90 %", share - _COVERAGE)
