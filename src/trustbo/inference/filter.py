@@ -1,6 +1,6 @@
 """Filter for the trust of robots during a mission, updated after every bound."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -157,15 +157,11 @@ class TrustFilter:
     def reset(self) -> None:
         """Start a new mission with equally weighted draws."""
         n = self.params.n_draws
-        self._belief = self.start()
+        offset = self.params.initial_offset[:, None, None]
+        self._belief = kalman.initial(self.space, self._n_robots // self.space.n_members, offset)
         self._log_weight = np.zeros(n)
         self.weights = np.full(n, 1.0 / n)
         self.n_bounds = 0
-
-    def start(self) -> kalman.Belief:
-        """Return trust before the first bound under each draw."""
-        offset = self.params.initial_offset[:, None, None]
-        return kalman.initial(self.space, self._n_robots // self.space.n_members, offset)
 
     @property
     def state(self) -> TrustState:
@@ -254,10 +250,9 @@ class TrustFilter:
 
         inputs = self.inputs(given, path)
         ticks = self.space.grouped(np.full(given.shape[:2], _TICKS))
-        ahead = kalman.forecast(self.space, self._belief, inputs, ticks, self.likelihood, rng)
         trust = []
         rates = []
-        for belief, drawn in ahead:
+        for belief, drawn in self.ahead(inputs, ticks, rng):
             trust.append(_average(belief, self.weights))
             rates.append(drawn)
 
@@ -265,6 +260,15 @@ class TrustFilter:
         mean, sd = (np.stack(column) for column in zip(*trust, strict=True))
         low, high = np.quantile(draws, _BAND, axis=0)
         return TrustForecast(mean, sd, draws.mean(0), low, high, draws)
+
+    def ahead(
+        self, inputs: Sequence[Inputs], n_ticks: np.ndarray, rng: np.random.Generator
+    ) -> Iterator[tuple[kalman.Belief, np.ndarray]]:
+        """Yield trust and drawn rates (draw, robot) of future bounds under each draw.
+
+        `inputs` are those of the method `inputs`, and `n_ticks` has shape (bound, group, member).
+        """
+        return kalman.forecast(self.space, self._belief, inputs, n_ticks, self.likelihood, rng)
 
     def inputs(self, awareness: np.ndarray, path: Sequence[Cell] | None) -> list[Inputs]:
         """Return the inputs (draw, group, member) of each bound of a path.

@@ -1,8 +1,10 @@
 """Scores of contact rates that were predicted before a mission."""
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from trustbo.data import Mission
@@ -18,7 +20,6 @@ from trustbo.workspace import Workspace
 
 INTERVALS = {"coverage_50": 0.5, "coverage_90": 0.9}
 """Share of rates that the central interval of each summary should contain."""
-_DIMS = ("mission", "bound", "robot")
 
 
 class Posteriors(list[xr.DataTree | None]):
@@ -99,39 +100,25 @@ def score(
     features = missions[0].features
     trust = _follow(in_order_of(trees[0], robots, features))
 
-    columns = {name: np.full(y.shape, np.nan) for name in ("mean", "pit", "log_score")}
-    quantile = np.full((*y.shape, len(QUANTILES)), np.nan)
+    parts = []
     for j, (tree, mission) in enumerate(zip(trees, missions, strict=True)):
         if j > 0 and tree is not trees[j - 1]:
             trust = _follow(in_order_of(tree, robots, features))
-
         require_ticks(trust.likelihood, y, observations.n_ticks)
-        k = slice(len(mission.bounds))
-        rng = stream(seed, "score", j)
-        ticks = observations.n_ticks[j, k]
+        parts.append(_scored(trust, mission, stream(seed, "score", j)))
 
-        columns["log_score"][j, k], drawn = _predict(trust, mission, y[j, k], ticks, rng)
-        columns["mean"][j, k] = np.where(np.isnan(y[j, k]), np.nan, drawn.mean(0))
-        columns["pit"][j, k] = _pit(drawn, y[j, k], rng)
-        quantile[j, k] = np.moveaxis(np.quantile(drawn, QUANTILES, axis=0), 0, -1)
-    quantile[np.isnan(y)] = np.nan
+    # Short missions are padded with NaN.
+    scores: Any = xr.concat(parts, pd.Index(indices, name="mission"), join="outer")
 
     # Scores of tick counts are comparable between families. They are NaN where ticks are unknown.
-    attrs = {"log_score_of": "contact_rate"}
+    scores.attrs["log_score_of"] = "contact_rate"
     shift = trust.likelihood.log_resolution(y, observations.n_ticks)
     if not np.isnan(shift).any():
-        columns["log_score"] += shift
-        attrs["log_score_of"] = "ticks"
+        scores["log_score"] += shift
+        scores.attrs["log_score_of"] = "ticks"
 
-    variables = {"contact_rate": (_DIMS, y), "quantile": ((*_DIMS, "level"), quantile)}
-    variables |= {name: (_DIMS, column) for name, column in columns.items()}
-    coords = {
-        "mission": indices,
-        "bound": np.arange(1, y.shape[1] + 1),
-        "robot": list(robots),
-        "level": list(QUANTILES),
-    }
-    return xr.Dataset(variables | _summary(y, **columns), coords, attrs)
+    columns = {name: scores[name].values for name in ("mean", "pit", "log_score")}
+    return scores.assign(_summary(y, **columns))
 
 
 def _follow(posterior: xr.DataTree) -> TrustFilter:
@@ -140,34 +127,41 @@ def _follow(posterior: xr.DataTree) -> TrustFilter:
     return TrustFilter(posterior, max_draws=sizes["chain"] * sizes["draw"])
 
 
-def _predict(
-    trust: TrustFilter,
-    mission: Mission,
-    y: np.ndarray,
-    ticks: np.ndarray,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return log densities (bound, robot) and draws (draw, bound, robot) of the rates."""
+def _scored(trust: TrustFilter, mission: Mission, rng: np.random.Generator) -> xr.Dataset:
+    """Return the variables of `score` (bound, robot) for one mission, without those of ticks."""
     z = mission.awareness
+    y = mission.contact_rate
+    counts = trust.space.grouped(mission.n_ticks)
     path = mission.path[: len(z) + 1] if trust.params.grid_shape and mission.path else None
 
-    counts = trust.space.grouped(ticks)
-    ahead = kalman.forecast(
-        trust.space, trust.start(), trust.inputs(z, path), counts, trust.likelihood, rng
-    )
-
-    log_scores = np.full(y.shape, np.nan)
+    log_score = np.empty(y.shape)
     drawn = []
-    for k, (belief, rates) in enumerate(ahead):
+    for k, (belief, rates) in enumerate(trust.ahead(trust.inputs(z, path), counts, rng)):
         of_rates = kalman.marginal_log_densities(
             trust.space, belief, trust.space.grouped(y[k]), counts[k], trust.likelihood
         )
 
         # Log of the mean density over the draws of the parameters.
-        density = np.logaddexp.reduce(of_rates, axis=0) - np.log(len(rates))
-        log_scores[k] = np.where(np.isnan(y[k]), np.nan, density)
+        log_score[k] = np.logaddexp.reduce(of_rates, axis=0) - np.log(len(rates))
         drawn.append(rates)
-    return log_scores, np.stack(drawn, axis=1)
+    drawn = np.stack(drawn, axis=1)
+
+    dims = ("bound", "robot")
+    quantile = np.moveaxis(np.quantile(drawn, QUANTILES, axis=0), 0, -1)
+    variables = {
+        "contact_rate": (dims, y),
+        "quantile": ((*dims, "level"), quantile),
+        "mean": (dims, drawn.mean(0)),
+        "pit": (dims, _pit(drawn, y, rng)),
+        "log_score": (dims, log_score),
+    }
+    coords = {
+        "bound": np.arange(1, len(y) + 1),
+        "robot": list(mission.robots),
+        "level": list(QUANTILES),
+    }
+    is_measured = xr.DataArray(~np.isnan(y), dims=dims)
+    return xr.Dataset(variables, coords).where(is_measured)
 
 
 def _summary(
@@ -258,10 +252,12 @@ def last_posterior(who: str, posteriors: Sequence[xr.DataTree | None]) -> xr.Dat
 
 
 def _pit(drawn: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Compute the randomised PIT of rates (bound, robot) among draws (draw, bound, robot)."""
+    """Compute the randomised PIT of rates (bound, robot) among draws (draw, bound, robot).
+
+    `loo_pit` of ArviZ is for rates to which a model was fitted, and can be 0 or 1 (see `by_rate`).
+    """
     below = (drawn < y).sum(0)
     equal = (drawn == y).sum(0)
 
     # The rank of y among the draws; ties are broken at random.
-    pit = (below + rng.random(y.shape) * (equal + 1.0)) / (len(drawn) + 1.0)
-    return np.where(np.isnan(y), np.nan, pit)
+    return (below + rng.random(y.shape) * (equal + 1.0)) / (len(drawn) + 1.0)
