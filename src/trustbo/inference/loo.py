@@ -24,6 +24,7 @@ from arviz_stats import sampling_diagnostics
 from arviz_stats.utils import ELPDDataLOO
 from scipy.optimize import brentq
 from scipy.special import expit, logsumexp
+from tqdm import tqdm
 
 from trustbo.arrays import evenly_spaced, in_order
 from trustbo.data import Mission
@@ -113,7 +114,6 @@ def estimated(
 ) -> ELPDDataLOO:
     """Leave out each mission that has rates, of a posterior as returned by `complete`."""
     model = _model_of(posterior, model)
-    is_class = isinstance(model, TrustModel)
     rates = posterior["observed_data"].to_dataset()[RATES]
     measured = np.flatnonzero(rates.notnull().any(("bound", "robot")))
     likelihood = posterior["log_likelihood"].to_dataset()[RATES].isel(mission=measured)
@@ -124,13 +124,9 @@ def estimated(
 
     with slow_bar("loo", " missions", progress, total=n_missions) as bar:
         log_p = likelihood
-        if is_class:
+        if isinstance(model, TrustModel):
             log_density = ratio_of_evidence(posterior, missions_of(posterior), model)
-            found = []
-            for j in measured:
-                found.append(log_density(int(j)))
-                bar.update()
-            log_p = xr.DataArray(np.stack(found, -1)[None], {"mission": labels}, likelihood.dims)
+            log_p = _by_mission(log_density, measured, labels, bar)
 
         n_draws = log_p.sizes["chain"] * log_p.sizes["draw"]
         ess = sampling_diagnostics.ess(log_p, method="bulk").min()
@@ -140,7 +136,7 @@ def estimated(
             sample_dims=["chain", "draw"], r_eff=n_effective / n_draws
         )
 
-        fewest = _FEWEST_OF_CLASS if is_class else _FEWEST
+        fewest = _FEWEST_OF_CLASS if isinstance(model, TrustModel) else _FEWEST
         is_refitted = ~(k_hat.values <= limit) | (n_missions < fewest)
         for i in np.flatnonzero(is_refitted):
             if model is None:
@@ -173,6 +169,19 @@ def estimated(
         good_k=limit,
         elpd_i=xr.DataArray(density.values, coords, "mission", attrs=attrs),
         pareto_k=xr.DataArray(k_hat.values, coords, "mission"),
+    )
+
+
+def _by_mission(
+    log_density: Callable[[int], np.ndarray], missions: np.ndarray, labels: np.ndarray, bar: tqdm
+) -> xr.DataArray:
+    """Return log densities (chain, draw, mission) in one chain, and count missions in a bar."""
+    found = []
+    for j in missions.tolist():
+        found.append(log_density(j))
+        bar.update()
+    return xr.DataArray(
+        np.stack(found, axis=-1)[None], {"mission": labels}, ("chain", "draw", "mission")
     )
 
 
