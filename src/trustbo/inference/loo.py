@@ -42,7 +42,7 @@ from trustbo.models.model import TrustModel
 from trustbo.models.record import model_from_record
 from trustbo.parallel import computing
 
-_POINTS = 1000
+_POINTS = 700
 """Maximum number of draws that are used for a model class."""
 _FEWEST = 4
 """Number of missions below which each one is left out by a refit, because weights would be
