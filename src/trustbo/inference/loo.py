@@ -217,7 +217,7 @@ def _model_of(posterior: xr.DataTree, model: Model | None) -> Model | None:
     features = names_in(posterior, "feature")
     if given is not None:
         given = given.for_features(features)
-    return model_from_record(record, given, features)
+    return model_from_record(record, given)
 
 
 def refit(posterior: xr.DataTree, model: Model, j: int) -> tuple[np.ndarray, float]:
