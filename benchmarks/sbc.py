@@ -22,6 +22,7 @@ from scipy import stats
 from tqdm import tqdm
 
 import trustbo as tb
+from trustbo.inference.classes import OfClass
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT
@@ -98,7 +99,7 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
     for j in range(n):
         rng = np.random.default_rng([seed, j])
         truth = draw_prior(before, rng)
-        rates = np.where(measured, replicate(before, truth, rng)[0], np.nan)
+        rates = np.where(measured, replicate(OfClass(before, truth), rng)[0], np.nan)
         posterior = Density(model, observations._replace(contact_rate=rates))
         drawn, _, summary = by_importance(posterior, n_ranked, int(rng.integers(2**31)))
         if summary["k_hat"] <= MAX_KHAT:

@@ -54,6 +54,17 @@ def of_each_robot(awareness, contact_rate=None, n_ticks=None):
     observed(drift, beta0, delta_w, delta_v, contact_rate, n_ticks, [RobotEffect().sample()])
 
 
+def with_own_noises(awareness, contact_rate=None, n_ticks=None):
+    """Noises of each robot, and memory that all robots share."""
+    beta0 = numpyro.sample("beta0", dist.Beta(2.0, 2.0))
+    with numpyro.plate("robot", awareness.shape[2]):
+        delta_w = numpyro.sample("delta_w", dist.HalfNormal(0.1))
+        delta_v = numpyro.sample("delta_v", dist.HalfNormal(0.1))
+    level = numpyro.sample("level", dist.Normal(0.3, 0.3))
+    drift = level + 0.0 * awareness[..., 0]
+    observed(drift, beta0, delta_w, delta_v, contact_rate, n_ticks, [RobotEffect().sample()])
+
+
 @pytest.fixture(scope="module")
 def workspace():
     awareness = np.random.default_rng(0).uniform(size=(3, 5, 5, 2))
@@ -125,7 +136,7 @@ def dense_log_density(target, values):
     return law.logpdf(rates.ravel()[seen])
 
 
-@pytest.mark.parametrize("function", [linear, of_each_robot])
+@pytest.mark.parametrize("function", [linear, of_each_robot, with_own_noises])
 def test_the_density_is_that_of_one_large_normal(function, missions):
     target = target_of(function, missions[:3])
     model = target.model

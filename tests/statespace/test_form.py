@@ -7,7 +7,10 @@ from scipy import stats
 from scipy.linalg import helmert
 from unit_noise import UnitNoise
 
+from trustbo.inference.functions.effects import layout_of
+from trustbo.inference.latent import Given, Source, draw_exactly
 from trustbo.models.families import FAMILIES
+from trustbo.models.observations import Observations
 from trustbo.statespace import Inputs, kalman
 from trustbo.statespace.blocks import Layout, LinearPredictor
 from trustbo.statespace.form import coupled_robots, independent_robots
@@ -166,22 +169,37 @@ def test_the_filter_has_the_density_and_the_trust_of_the_joint_normal(name, offs
             np.testing.assert_allclose(apart[point], np.nan_to_num(of_each), rtol=1e-9, atol=1e-11)
 
 
+def drawn_trust(space, drift, of_bounds, rates, rng):
+    """Trust (point, bound, robot) of a mission given its rates, and their log-likelihood."""
+    shape = (1, *rates.shape)
+    observations = Observations(rates[None], np.zeros((*shape, 0)), np.full(shape, np.nan))
+    blocks = layout_of(space, rates[None])
+    source = Source(len(space.transition), observations, FAMILIES["gaussian"], *blocks)
+    layout = source.layout
+    predictor = LinearPredictor.from_space(space, layout)
+    u, o = (layout.rows(values[None, None]) for values in (drift, of_bounds))
+    mean = predictor.mean_given(u, source.label) + o
+    given = Given(np.arange(source.n_draws), predictor, mean)
+    trust, log_p = draw_exactly(source, given, rng)
+    return layout.unstack(trust)[:, 0], log_p[:, 0]
+
+
 @pytest.mark.parametrize("point", range(N_POINTS))
 @pytest.mark.parametrize("name", SPACES)
 def test_trust_is_drawn_from_the_joint_normal_given_the_rates(name, point):
-    """Its mean and covariance, up to the variance of 1e-12 that keeps draws from failing."""
     space, forms = SPACES[name]
-    drift, of_bounds, inputs = inputs_of(space)
+    drift, of_bounds, _ = inputs_of(space)
     rates = rates_of()
     copies = space.take(np.full(1 + K * N_ROBOTS, point))
     rng = UnitNoise()
-    y = space.grouped(rates)
-    drawn = kalman.draw_trust(copies, inputs, y, n_groups_of(space), rng)
+    drawn, log_p = drawn_trust(copies, drift, of_bounds, rates, rng)
 
     mean, cov = rng.moments(drawn)
-    expected_mean, expected_cov = mission_of(forms[point], drift, of_bounds).trust_given(rates)
+    dense = mission_of(forms[point], drift, of_bounds)
+    expected_mean, expected_cov = dense.trust_given(rates)
     np.testing.assert_allclose(mean, expected_mean, rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(cov, expected_cov, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(log_p, dense.log_density(rates), rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["different robots", "coupled"])
@@ -189,13 +207,11 @@ def test_many_draws_of_trust_have_the_moments_of_the_joint_normal(name):
     """Within 5 standard errors; numbers of a generator differ from point to point."""
     n = 4000
     space, forms = SPACES[name]
-    drift, of_bounds, inputs = inputs_of(space)
+    drift, of_bounds, _ = inputs_of(space)
     rates = rates_of()
     copies = space.take(np.zeros(n, int))
-    groups = n_groups_of(space)
-    drawn = kalman.draw_trust(
-        copies, inputs, space.grouped(rates), groups, np.random.default_rng(0)
-    ).reshape(n, -1)
+    rng = np.random.default_rng(0)
+    drawn = drawn_trust(copies, drift, of_bounds, rates, rng)[0].reshape(n, -1)
 
     mean, cov = mission_of(forms[0], drift, of_bounds).trust_given(rates)
     sd = np.sqrt(np.diag(cov))

@@ -10,25 +10,17 @@ as log-likelihoods, and draws from the same distributions as predictions. Each r
 predicted from the earlier rates of its mission, and PIT values are uniform if the model is correct.
 """
 
-from collections.abc import Iterator
-from typing import NamedTuple
-
 import numpy as np
 import xarray as xr
-from scipy import sparse
 
 from trustbo.arrays import evenly_spaced
-from trustbo.inference.density import chunks
-from trustbo.inference.draws import as_fitted, missions_of, read_posterior
-from trustbo.inference.functions.fit import forms_of_function
-from trustbo.inference.functions.function import FunctionModel
-from trustbo.inference.learner import FunctionLearner, Model, learner_of_posterior
+from trustbo.inference.draws import as_fitted, missions_of
+from trustbo.inference.latent import Source
+from trustbo.inference.learner import Model, learner_of_posterior
 from trustbo.inference.tree import LIKELIHOOD_OF, RATES, TICKS
-from trustbo.models.families import FAMILIES, Family
-from trustbo.models.observations import Observations
 from trustbo.parallel import computing
 from trustbo.statespace import kalman
-from trustbo.statespace.blocks import Layout, LinearPredictor, each
+from trustbo.statespace.blocks import each
 from trustbo.streams import stream
 
 _NUMBERS = 2_000_000
@@ -40,16 +32,6 @@ _PER_DRAW = ("posterior", "sample_stats", "log_prior")
 """Groups from which the chosen draws are copied."""
 _COPIED = ("prior",)
 """Groups that are copied unchanged."""
-
-
-class _Source(NamedTuple):
-    """Everything that is needed to predict the rates of a posterior."""
-
-    observations: Observations
-    layout: Layout
-    likelihood: Family
-    predictors: Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]  # one item per chunk of draws
-    of_counts: bool  # whether log-likelihoods are of tick counts if every rate has one
 
 
 @computing()
@@ -93,11 +75,8 @@ def by_rate(posterior: xr.DataTree, *, model: Model | None = None) -> xr.DataTre
     some = (np.arange(n_chains)[:, None] * sizes["draw"] + kept).ravel()
 
     learner = learner_of_posterior(posterior, model)
-    if isinstance(learner, FunctionLearner):
-        source = _of_function(posterior, learner.model, some)
-    else:
-        source = _of_class(posterior, model, some)
-    log_p, predicted, of_ticks = _predicted(source, int(posterior.attrs["seed"]))
+    source = learner.source(posterior, missions_of(posterior), contrasts=False)
+    log_p, predicted = _predicted(source, some, int(posterior.attrs["seed"]))
 
     def by_chain(values: np.ndarray) -> xr.DataArray:
         chained = values.reshape(n_chains, len(kept), -1)
@@ -126,7 +105,7 @@ def by_rate(posterior: xr.DataTree, *, model: Model | None = None) -> xr.DataTre
         )
 
     tree = xr.DataTree.from_dict(groups)
-    tree.attrs = {LIKELIHOOD_OF: TICKS if of_ticks else RATES}
+    tree.attrs = {LIKELIHOOD_OF: TICKS if source.of_counts else RATES}
     return tree
 
 
@@ -165,85 +144,15 @@ def _features(posterior: xr.DataTree, rates: xr.DataArray) -> xr.Dataset:
     ).assign_coords(rates.coords)
 
 
-# --- distributions of linear predictors ---
-
-
-def _of_class(posterior: xr.DataTree, model: Model | None, some: np.ndarray) -> _Source:
-    """Return the linear predictors of a model class, given its coefficients."""
-    fitted, draws = read_posterior(posterior, model=model)  # pyright: ignore[reportArgumentType]
-    draws = draws.at(some)
-    observations = fitted.observations
-    layout = fitted.model.layout(observations, contrasts=False)
-    terms = [effect.design(observations) for effect in fitted.model.terms]
-    design = layout.design(sparse.hstack(terms, format="csr"))
-
-    def predictors() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        for where, theta in chunks(draws.theta):
-            predictor = fitted.model.linear_predictor(theta, observations, layout)
-            inputs = (design @ draws.c[where].T).T
-            inputs = inputs.reshape(len(inputs), len(layout.label), -1)
-            yield _given(predictor, inputs, 0.0, layout.label)
-
-    return _Source(observations, layout, fitted.model.likelihood, predictors(), True)
-
-
-def _of_function(posterior: xr.DataTree, model: FunctionModel, some: np.ndarray) -> _Source:
-    """Return the linear predictors of a function."""
-    missions = missions_of(posterior)
-    observations = Observations.from_missions(missions)
-    shape = observations.contact_rate.shape
-    first, forms = _peeked(forms_of_function(posterior, missions, model, some))
-    space, _, of_counts = first
-    layout = Layout(shape, joint=space.n_members > 1)  # pyright: ignore[reportArgumentType]
-
-    # Blocks are missions or, if robots are independent, (mission, robot), and robots may differ.
-    label = layout.label
-    if not layout.joint:
-        label = np.tile(np.arange(shape[2]), shape[0])
-
-    def predictors() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        for space, inputs, _ in forms:
-            predictor = LinearPredictor.from_space(space, layout)
-            n_draws = len(space.transition)
-            drift = np.asarray(inputs.drift).reshape(n_draws, *shape)
-            offset = np.asarray(inputs.offset).reshape(n_draws, *shape)
-            yield _given(predictor, layout.rows(drift), layout.rows(offset), label)
-
-    return _Source(observations, layout, FAMILIES["gaussian"], predictors(), of_counts)
-
-
-def _peeked[T](items: Iterator[T]) -> tuple[T, Iterator[T]]:
-    """Return the first item, and all items."""
-    first = next(items)
-
-    def every() -> Iterator[T]:
-        yield first
-        yield from items
-
-    return first, every()
-
-
-def _given(
-    predictor: LinearPredictor, inputs: np.ndarray, offset: np.ndarray | float, label: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mean, covariance and noise of linear predictors; see `kalman.one_step_ahead`.
-
-    `inputs` have the shape (draw, block, input).
-    """
-    response = each(predictor.response, label)
-    mean = each(predictor.mean, label) + (response @ inputs[..., None])[..., 0] + offset
-    return mean, each(predictor.covariance, label), each(predictor.noise_sd, label)
-
-
 # --- predictions one step ahead ---
 
 
-def _predicted(source: _Source, seed: int) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Predict each measured rate from the earlier rates of its mission.
+def _predicted(source: Source, some: np.ndarray, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Predict each measured rate from the earlier rates of its mission, for some draws.
 
     Returns:
-        Log-likelihoods (draw, rate), predicted rates (draw, rate), and whether the log-likelihoods
-        are of tick counts.
+        Log-likelihoods (draw, rate), of tick counts if the source is `of_counts`, and predicted
+        rates (draw, rate).
     """
     observations = source.observations
     likelihood = source.likelihood
@@ -254,18 +163,18 @@ def _predicted(source: _Source, seed: int) -> tuple[np.ndarray, np.ndarray, bool
 
     log_p = []
     predicted = []
-    for mean, cov, sd in source.predictors:
-        ahead = kalman.one_step_ahead(mean, cov, sd, y, n_ticks, likelihood)
-        f = ahead.mean + np.sqrt(ahead.var) * rng.standard_normal(mean.shape)
+    for given in source.given(some):
+        cov = each(given.predictor.covariance, source.label)
+        sd = each(given.predictor.noise_sd, source.label)
+        ahead = kalman.one_step_ahead(given.mean, cov, sd, y, n_ticks, likelihood)
+        f = ahead.mean + np.sqrt(ahead.var) * rng.standard_normal(given.mean.shape)
         drawn = likelihood.sample(f, sd, n_ticks, rng)
 
         log_p.append(source.layout.unstack(ahead.log_p)[:, is_measured])
         predicted.append(source.layout.unstack(drawn)[:, is_measured])
 
-    # Log likelihoods of tick counts are comparable between families; NaN where ticks are unknown.
-    shift = likelihood.log_resolution(observations.contact_rate, observations.n_ticks)
-    of_ticks = source.of_counts and not np.isnan(shift).any()
     joined = np.concatenate(log_p)
-    if of_ticks:
+    if source.of_counts:
+        shift = likelihood.log_resolution(observations.contact_rate, observations.n_ticks)
         joined = joined + shift[is_measured]
-    return joined, np.concatenate(predicted), of_ticks
+    return joined, np.concatenate(predicted)

@@ -4,9 +4,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from scipy import sparse, special
+from scipy import special
 
 from trustbo.inference import ep, gradient
+from trustbo.inference.columns import Columns
 from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, evidence, expected
 from trustbo.inference.importance import Student, climb
 from trustbo.models.effects.effect import Theta
@@ -136,17 +137,15 @@ class Density:
         self.scores = model.scores(observations)
         self.n_scores = self.scores.n_scores
 
-        designs = [effect.design(observations) for effect in model.terms]
-        self.ends = np.cumsum([0, *(U.shape[1] for U in designs)])
-        self._U = self.layout.design(sparse.hstack(designs, format="csr"))
+        self.columns = Columns(model.terms, observations)
+        self.prior = self.columns.prior
         self.exact = model.likelihood.gaussian
 
         # Which columns depend on each other a priori does not depend on theta, so any will do.
         y = self.layout.rows(observations.contact_rate)
         prior = self.prior(self.theta(np.zeros((1, self.n_scores))))
-        self.blocks = Blocks.from_rows(
-            y, self._U, self.layout.label, prior=prior, apart=not self.exact
-        )
+        U = self.layout.design(self.columns.U)
+        self.blocks = Blocks.from_rows(y, U, self.layout.label, prior=prior, apart=not self.exact)
         if not self.exact:
             self.rates = ep.Rates(model.likelihood, y, self.layout.rows(observations.n_ticks))
             self.reset_ep()
@@ -189,7 +188,7 @@ class Density:
     def visit(self, z: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Coefficients]:
         """Compute the log density of `log_density` and the coefficients at each point."""
         log_p = np.full(len(z), -np.inf)
-        found = Coefficients.empty(len(z), self._U.shape[1])
+        found = Coefficients.empty(len(z), self.columns.n)
 
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
             theta, log_prior, some = self._possible(z)
@@ -327,12 +326,6 @@ class Density:
             mean, deviation, _ = coefficients_of(prior, fit, 1, rng)
             drawn.append(mean + deviation[:, 0])
         return np.concatenate(drawn)
-
-    def prior(self, theta: Theta) -> Prior:
-        """Return the prior on all coefficients at each theta."""
-        return Prior.from_groups(
-            [effect.prior(theta, self.observations) for effect in self.model.terms]
-        )
 
     def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence at each theta, as in `log_density`; also return the prior."""

@@ -355,7 +355,7 @@ def _in_order(
         ordered = in_order("the posterior", group.to_dataset(), names)
         if name == "places":
             ordered = in_order_of_places(ordered)
-        groups[name] = _transposed(ordered, dims if name in _OF_VARIABLES else {})
+        groups[name] = transposed(ordered, dims if name in _OF_VARIABLES else {})
 
     whole = xr.DataTree.from_dict(groups)
     whole.attrs = posterior.attrs | {"robots": list(robots), "features": list(features)}
@@ -382,7 +382,7 @@ def _names_along(
     return {}
 
 
-def _transposed(group: xr.Dataset, dims: Mapping[str, Sequence[str]]) -> xr.Dataset:
+def transposed(group: xr.Dataset, dims: Mapping[str, Sequence[str]]) -> xr.Dataset:
     """Return a group with the axes of each variable in order.
 
     `dims` has the axes of the variables of a function, after (chain, draw), which may be in any
@@ -480,10 +480,15 @@ def read_posterior(
     record = json.loads(posterior.attrs["model_record"])
     model = model_from_record(record, model).for_features(features)
 
-    fitted = Density(model, model.observations(missions))
-    groups = {"posterior": parameters_of(posterior)}
-    groups |= {effect.group: values_of(posterior, effect) for effect in model.effects}
-    return fitted, draws_of(fitted, groups)
+    density = Density(model, model.observations(missions))
+    return density, stored_draws(density, posterior)
+
+
+def stored_draws(density: Density, posterior: xr.DataTree) -> JointDraws:
+    """Return the draws of a posterior, with chains joined."""
+    groups = {"posterior": parameters_of(posterior, density.model)}
+    groups |= {effect.group: values_of(posterior, effect) for effect in density.model.effects}
+    return draws_of(density, groups)
 
 
 def in_order_of_features(missions: Iterable[Mission], posterior: xr.DataTree) -> list[Mission]:

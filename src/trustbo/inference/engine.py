@@ -64,12 +64,7 @@ class Blocks(NamedTuple):
         n_inputs = U.shape[0] // n_blocks
         U = sparse.csr_array(U)
 
-        # A row of `kinds` contains a number that can keep blocks apart, the label, and the seen
-        # rows.
-        seen = ~np.isnan(y)
-        number = np.arange(n_blocks) if apart else np.zeros(n_blocks, dtype=int)
-        kinds, kind = np.unique(np.column_stack([number, label, seen]), axis=0, return_inverse=True)
-        kind = kind.ravel()
+        kind, label_of_kind, seen = kinds_of(y, label, apart=apart)
 
         # Pairs of inputs are unordered: one number stands for both (k, j) and (j, k).
         above = upper(n_inputs)
@@ -78,7 +73,7 @@ class Blocks(NamedTuple):
         pair[above] = pair.T[above] = np.arange(n_pairs)
 
         parts = []
-        for g in range(len(kinds)):
+        for g in range(len(seen)):
             rows = (np.flatnonzero(kind == g)[:, None] * n_inputs + np.arange(n_inputs)).ravel()
             X = sparse.csr_array(U[rows].reshape(len(rows) // n_inputs, n_inputs * n_columns))
             products = (X.T @ X).tocoo()
@@ -99,14 +94,14 @@ class Blocks(NamedTuple):
         entry = order.entry(a, b)
         kept = entry >= 0
         at, row = np.unique(entry[kept], return_inverse=True)
-        shape = len(at), len(kinds) * n_pairs
+        shape = len(at), len(seen) * n_pairs
         sums = sparse.csr_array((values[kept], (row, where[kept])), shape=shape)
         return cls(
-            y=np.where(seen, y, 0.0),
+            y=np.where(np.isnan(y), 0.0, y),
             U=U,
             kind=kind,
-            label=kinds[:, 1],
-            seen=kinds[:, 2:].astype(bool),
+            label=label_of_kind,
+            seen=seen,
             sums=sums,
             at=at,
             of_prior=prior.entries(order),
@@ -283,7 +278,7 @@ def evidence(
         lam: Site precisions (point, kind, row), 0 where nothing was measured.
         y: Site means (point, block, row), if different from the observations.
     """
-    W, log_sites = whiten(blocks, predictor, lam)
+    W, log_sites = whiten(blocks.label, predictor, lam)
     b = blocks
     residual = (b.y if y is None else y) - expected(b, predictor, prior.mean)
     F, half, w = regress(b, W, residual, each(predictor.response, b.label), prior.parts)
@@ -326,9 +321,35 @@ def regress(
     return F, F.forward(h), w
 
 
-def whiten(blocks: Blocks, predictor: LinearPredictor, lam: Any) -> tuple[Any, Any]:
-    """Return whitening matrices W (point, kind, row, row) and log densities at zero residual."""
-    V = each(predictor.covariance, blocks.label)
+def kinds_of(
+    y: np.ndarray, label: np.ndarray, *, apart: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Group blocks into kinds, which have equal labels and equal missing rows.
+
+    Args:
+        y: Observations (block, row), NaN where not measured.
+        label: Label (block,) of each block.
+        apart: Whether each block is a separate kind.
+
+    Returns:
+        The kind (block,) of each block, and the label (kind,) and seen rows (kind, row) of each
+        kind.
+    """
+    number = np.arange(len(y)) if apart else np.zeros(len(y), dtype=int)
+    key = np.column_stack([number, label, ~np.isnan(y)])
+    kinds, kind = np.unique(key, axis=0, return_inverse=True)
+    return kind.ravel(), kinds[:, 1], kinds[:, 2:].astype(bool)
+
+
+def whiten(label: np.ndarray, predictor: LinearPredictor, lam: Any) -> tuple[Any, Any]:
+    """Return whitening matrices W (point, kind, row, row) and log densities at zero residual.
+
+    Args:
+        label: Label (kind,) of each kind of blocks.
+        predictor: Distribution of the linear predictors given the coefficients.
+        lam: Site precisions (point, kind, row), 0 where nothing was measured.
+    """
+    V = each(predictor.covariance, label)
     some = lam > 0.0
     d = np.where(some, lam, 0.0) ** 0.5
 
@@ -345,12 +366,7 @@ def inputs(blocks: Blocks, c: np.ndarray) -> np.ndarray:
 
 def expected(blocks: Blocks, predictor: LinearPredictor, c: Any) -> Any:
     """Compute the mean linear predictors (point, block, row) given coefficients (point, column)."""
-    drift = inputs(blocks, c)
-    label = blocks.label[blocks.kind]
-    if predictor.response.shape[1] == 1:  # one product for all blocks is faster
-        response = np.swapaxes(predictor.response[:, 0], 1, 2)
-        return each(predictor.mean, label) + drift @ response
-    return each(predictor.mean, label) + (predictor.response[:, label] @ drift[..., None])[..., 0]
+    return predictor.mean_given(inputs(blocks, c), blocks.label[blocks.kind])
 
 
 def coefficients_of(

@@ -283,7 +283,7 @@ def draw_predictors(
     seen = ~np.isnan(rates.y)
 
     # Normal distribution of the predictors of a block given its sites.
-    W, log_sites = whiten(blocks, predictor, lam)
+    W, log_sites = whiten(blocks.label, predictor, lam)
     V = each(predictor.covariance, blocks.label)
     n_rows = V.shape[-1]
     gain = V @ (np.swapaxes(W, 2, 3) @ W)

@@ -3,7 +3,6 @@
 import json
 import time
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,33 +18,18 @@ from trustbo.errors import (
     require_kind,
     require_whole,
 )
+from trustbo.inference.classes import OfClass
 from trustbo.inference.density import Coefficients, Density, JointDraws
-from trustbo.inference.draws import as_fitted, names_in, require_fitted
-from trustbo.inference.functions.fit import (
-    fit_function,
-    require_poolable_with_function,
-    with_latent_of_function,
-)
+from trustbo.inference.draws import as_fitted, names_in, stored_draws
+from trustbo.inference.functions.fit import fit_function, require_poolable_with_function
 from trustbo.inference.functions.function import as_model
-from trustbo.inference.functions.sampling import AUTO
 from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
-from trustbo.inference.importance import (
-    MAX_KHAT,
-    Points,
-    Student,
-    sample,
-)
+from trustbo.inference.importance import MAX_KHAT, Points, Student, sample
+from trustbo.inference.latent import N_PRIOR
 from trustbo.inference.nuts import sample_by_nuts
-from trustbo.inference.place_maps import place_group
-from trustbo.inference.tree import (
-    N_PRIOR,
-    default_draws,
-    in_label_order,
-    to_datatree,
-    with_latent,
-)
-from trustbo.inference.variables import draws_of, prior_parameters, to_variables
-from trustbo.models.backend import library_attrs
+from trustbo.inference.options import Options
+from trustbo.inference.tree import Fitted, by_chain, default_draws, to_tree, with_latent
+from trustbo.inference.variables import prior_parameters, to_variables
 from trustbo.models.default import default_model
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
@@ -156,53 +140,31 @@ def fit(
     if all(np.isnan(mission.contact_rate).all() for mission in missions):
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
 
-    add_latent: Callable[[xr.DataTree], xr.DataTree]
-    if isinstance(model, TrustModel | type) or not callable(model):
+    is_class = isinstance(model, TrustModel | type) or not callable(model)
+    samplers = SAMPLERS if is_class else OF_FUNCTIONS
+    sampler = samplers[0] if sampler is None else require_choice("sampler", sampler, samplers)
+    options = Options(sampler, draws, chains, warmup, seed, progress, check, start)
+    if is_class:
         remedy = "give a model such as PooledTrust(), or a NumPyro function"
-        trust_model: TrustModel = require_kind("model", model, TrustModel, remedy)
-        require_poolable_with_model(trust_model, earlier, robots)
-        sampler = SAMPLERS[0] if sampler is None else require_choice("sampler", sampler, SAMPLERS)
-        if draws is None:
-            draws = default_draws(trust_model.effects, sampler)
-        tree, complaints, add_latent = _fit_model(
-            missions, trust_model, sampler, workspace, draws, chains, warmup, seed, progress, start
-        )
+        of_class: TrustModel = require_kind("model", model, TrustModel, remedy)
+        require_poolable_with_model(of_class, earlier, robots)
+        found = fit_class(missions, of_class, workspace, options)
     else:
-        function = as_model(model)
+        function = as_model(model)  # pyright: ignore[reportArgumentType]
         require_poolable_with_function(function, earlier, robots)
-        sampler = AUTO if sampler is None else require_choice("sampler", sampler, OF_FUNCTIONS)
-        if start is not None:
-            start = as_fitted("start", start)  # its draws are read by position
-        tree, complaints = fit_function(
-            missions,
-            function,
-            workspace,
-            sampler,
-            draws,
-            chains,
-            warmup,
-            seed,
-            progress,
-            check,
-            start,
-        )
-        add_latent = partial(
-            with_latent_of_function,
-            missions=missions,
-            model=function,
-            progress=progress,
-        )
+        found = fit_function(missions, function, workspace, options)
 
-    if check and complaints:
+    tree = to_tree(found, missions, seed)
+    if check and found.complaints:
         raise PosteriorError(
-            f"the sampler's diagnostics are bad: {'; '.join(complaints)}.",
+            f"the sampler's diagnostics are bad: {'; '.join(found.complaints)}.",
             tree,
             "Give more missions, use narrower priors or, for NUTS, increase draws and warmup. To "
             "get the posterior anyway, pass check=False.",
         )
 
     if latent:
-        tree = add_latent(tree)
+        tree = with_latent(tree, missions, found.source(tree), progress=progress)
     if earlier:
         _label_earlier(tree, len(earlier), missions[0].robots[len(robots) :])
     tree.attrs["seconds"] = time.perf_counter() - started
@@ -214,7 +176,7 @@ def _same_names(start: xr.DataTree | None, mission: Mission) -> xr.DataTree | No
     if start is None:
         return None
 
-    start = require_fitted("start", start)
+    start = as_fitted("start", start)  # draws of a function are read by position
     same_robots = names_in(start, "robot") in ((), mission.robots)
     same_features = names_in(start, "feature") in ((), mission.features)
     return start if same_robots and same_features else None
@@ -254,51 +216,65 @@ def _label_earlier(tree: xr.DataTree, n_earlier: int, others: Sequence[str]) -> 
         tree.attrs["other_robots"] = list(others)
 
 
-def _fit_model(
+def fit_class(
     missions: Sequence[Mission],
     model: TrustModel,
-    sampler: str,
     workspace: Workspace | None,
-    draws: int,
-    chains: int,
-    warmup: int | None,
-    seed: int,
-    progress: bool,
-    start: xr.DataTree | None,
-) -> tuple[xr.DataTree, list[str], Callable[[xr.DataTree], xr.DataTree]]:
-    """Fit a model class; return the posterior, failed checks and a function like `add_latent`."""
+    options: Options,
+) -> Fitted:
+    """Fit a model class to missions."""
     model = model.for_features(missions[0].features)
     density = Density(model, model.observations(missions, workspace))
-    if sampler == "importance":
-        draws = chains * draws
-        chains = 1  # independent draws belong to one chain
-        first = _first_proposal(start, model)
-        with slow_bar("fit", " points", progress) as bar:
+    record = json.dumps(model_to_record(model))
+    draws = options.draws or default_draws(model.effects, options.sampler)
+    if options.sampler == "importance":
+        first = _first_proposal(options.start, record)
+        with slow_bar("fit", " points", options.progress) as bar:
             density.evaluated = bar.update
-            drawn, stats, summary = by_importance(density, draws, seed, first)
+            drawn, stats, summary = by_importance(
+                density, options.chains * draws, options.seed, first
+            )
 
+        stats = {name: values[None] for name, values in stats.items()}  # in one chain
+        notes = {"sample_stats": {"proposal": summary.pop("proposal")}}
         complaints = []
         if not summary["k_hat"] <= MAX_KHAT:
             reason = f"k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT}"
             complaints.append(f"importance weights are uneven ({reason})")
     else:
         drawn, stats, summary, complaints = sample_by_nuts(
-            density, chains=chains, draws=draws, warmup=warmup, seed=seed, progress=progress
+            density,
+            chains=options.chains,
+            draws=draws,
+            warmup=options.warmup,
+            seed=options.seed,
+            progress=options.progress,
         )
+        stats = by_chain(stats, options.chains)
+        notes = {}
 
-    variables = to_variables(density, drawn)
-    tree = _laid_out(density, variables, stats, (chains, draws), missions, seed)
-    if "proposal" in summary:
-        tree["sample_stats"].attrs["proposal"] = summary.pop("proposal")
-    tree.attrs |= _record(model, density) | summary | {"sampler": sampler, "seed": seed}
-    tree.attrs |= {"robots": list(missions[0].robots), "features": list(missions[0].features)}
-    tree.attrs |= library_attrs(sampler)
-
-    def add_latent(posterior: xr.DataTree) -> xr.DataTree:
-        as_read = draws_of(density, variables)  # equal to what `add_latent` reads from a file
-        return with_latent(posterior, missions, density, as_read, progress=progress)
-
-    return tree, complaints, add_latent
+    resolution = density.observations.resolution if model.likelihood.adds_noise else 0.0
+    return Fitted(
+        variables=to_variables(density, drawn),
+        prior=prior_parameters(density, N_PRIOR, np.random.default_rng([options.seed, 3])),
+        dims=model.dims,
+        labels={},
+        effects=model.effects,
+        observations=density.observations,
+        statistics=stats,
+        attrs={
+            "model": type(model).__name__,
+            "model_record": record,
+            **_described(model),
+            "resolution": resolution,
+            "sampler": options.sampler,
+            **summary,
+        },
+        notes=notes,
+        by_position=False,
+        complaints=complaints,
+        source=lambda tree: OfClass(density, stored_draws(density, tree)),
+    )
 
 
 def by_importance(
@@ -377,54 +353,17 @@ def _corrected(
     return Points.from_log_weights(points.z, points.log_p, log_ratio, points.near), c
 
 
-def _first_proposal(start: xr.DataTree | None, model: TrustModel) -> Student | None:
-    """Return the proposal of a posterior of the same model, or None if there is none."""
-    if start is None or start.attrs["model_record"] != json.dumps(model_to_record(model)):
+def _first_proposal(start: xr.DataTree | None, record: str) -> Student | None:
+    """Return the proposal of a posterior of a model with this record, or None."""
+    if start is None or start.attrs["model_record"] != record:
         return None
 
     text = start["sample_stats"].attrs.get("proposal")
     return None if text is None else Student.from_text(text)
 
 
-def _laid_out(
-    density: Density,
-    variables: dict[str, dict[str, np.ndarray]],
-    stats: dict[str, np.ndarray],
-    shape: tuple[int, int],
-    missions: Sequence[Mission],
-    seed: int,
-) -> xr.DataTree:
-    """Build a DataTree from the data, and from posterior and prior draws."""
-    rng = np.random.default_rng([seed, 3])
-    groups = variables | {"sample_stats": stats}
-    groups = {
-        group: {name: v.reshape(*shape, *v.shape[1:]) for name, v in values.items()}
-        for group, values in groups.items()
-    }
-    places = groups.pop("places", None)  # has its own axes
-
-    prior_draws = prior_parameters(density, N_PRIOR, rng)
-    groups["prior"] = {name: values[None] for name, values in prior_draws.items()}
-
-    dims = in_label_order(groups, density.model.dims)
-    tree = to_datatree(groups, missions, dims, density.model.effects)
-    if places is not None:
-        at: Any = density.observations.visited
-        tree["places"] = xr.DataTree(place_group(places, at, missions[0].robots, seed))
-    return tree
-
-
-def _record(model: TrustModel, density: Density) -> dict[str, Any]:
-    """Make the attributes that describe the model and the data of a posterior."""
-    observations = density.observations
+def _described(model: TrustModel) -> dict[str, Any]:
+    """Return the options and priors of a model as attributes of a posterior."""
     options = {name: int(v) if isinstance(v, bool) else v for name, v in model.options().items()}
-    return {
-        "model": type(model).__name__,
-        **options,
-        "model_record": json.dumps(model_to_record(model)),
-        "n_robots": observations.n_robots,
-        "n_missions": observations.n_missions,
-        **model.x0,
-        "resolution": observations.resolution if model.likelihood.adds_noise else 0.0,
-        **{f"prior_{name}": text for name, text in model.priors.describe().items()},
-    }
+    priors = {f"prior_{name}": text for name, text in model.priors.describe().items()}
+    return {**options, **model.x0, **priors}

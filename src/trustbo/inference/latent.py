@@ -1,20 +1,90 @@
 """Latent trust, likelihoods and predicted contact rates given draws of the parameters."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
+import xarray as xr
+from tqdm import tqdm
 
-from trustbo.inference import ep
-from trustbo.inference.density import Density, JointDraws, chunks
-from trustbo.inference.engine import expected, whiten
+from trustbo.inference.engine import kinds_of, whiten
 from trustbo.inference.factor import cholesky
-from trustbo.models.effects.effect import Theta
-from trustbo.statespace.blocks import LinearPredictor, each
+from trustbo.models.families import Family
+from trustbo.models.observations import Observations
+from trustbo.statespace.blocks import Layout, LinearPredictor, each
 
-_PARTICLES = 4
-"""Number of linear predictors drawn for each draw of the coefficients."""
+N_PRIOR = 500
+"""Number of draws in the group `prior`."""
+N_TRAJECTORIES = 200
+"""Number of kept draws of latent trust and predicted rates, evenly spaced in the chains."""
+
+
+class Given(NamedTuple):
+    """Linear predictors of all blocks at some draws, given the parameters and effects."""
+
+    some: np.ndarray  # indices of the draws
+    predictor: LinearPredictor
+    mean: np.ndarray  # of the linear predictors, (draw, block, row)
+    log_likelihood: Any = None  # (draw, mission), where it is known
+    log_prior: Any = None  # (draw,) of each variable by name, where it is known
+
+
+class Source:
+    """Draws of the parameters and effects of a model, with missions.
+
+    Attributes:
+        n_draws: Number of draws.
+        observations: Rates and awareness of the missions.
+        likelihood: Observation family.
+        layout: Layout of the rates in blocks.
+        label: Index (block,) of each block on the second axis of a `LinearPredictor`.
+        shift: Log ratio (mission,) of the probability of tick counts to the density of rates; NaN
+            where ticks are unknown.
+    """
+
+    def __init__(
+        self,
+        n_draws: int,
+        observations: Observations,
+        likelihood: Family,
+        layout: Layout,
+        label: np.ndarray,
+    ) -> None:
+        self.n_draws = n_draws
+        self.observations = observations
+        self.likelihood = likelihood
+        self.layout = layout
+        self.label = label
+        y = observations.contact_rate
+        self.shift = likelihood.log_resolution(y, observations.n_ticks).sum((1, 2))
+
+    @property
+    def of_counts(self) -> bool:
+        """Whether log-likelihoods are those of tick counts, comparable between families."""
+        return not np.isnan(self.shift).any()
+
+    @property
+    def first_equal(self) -> np.ndarray:
+        """Index (draw,) of the first draw that equals each draw, which is evaluated only once."""
+        return np.arange(self.n_draws)
+
+    def given(self, some: np.ndarray) -> Iterator[Given]:
+        """Yield the linear predictors of some draws, in chunks."""
+        raise NotImplementedError
+
+    def draw(
+        self, given: Given, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Draw trust (draw, block, row) given the rates.
+
+        Also return the log-likelihoods (draw, mission), of tick counts if possible, and the log
+        prior density (draw,) of each parameter by name.
+        """
+        raise NotImplementedError
+
+    def prior(self, posterior: xr.DataTree, rng: np.random.Generator) -> "Source":
+        """Return `N_TRAJECTORIES` draws from the prior, evenly spaced in the group `prior`."""
+        raise NotImplementedError
 
 
 class Latent(NamedTuple):
@@ -23,136 +93,104 @@ class Latent(NamedTuple):
     trust: np.ndarray  # (kept draw, mission, bound, robot)
     mean: np.ndarray  # (mission, bound, robot), over all draws
     sd: np.ndarray  # (mission, bound, robot), over all draws
-    log_likelihood: np.ndarray  # (draw, mission)
     predicted: np.ndarray  # (kept draw, mission, bound, robot), replicated rates
+    log_likelihood: np.ndarray  # (draw, mission)
+    log_prior: dict[str, np.ndarray]  # (draw,) by name
 
 
-def latent_of(
-    density: Density, draws: JointDraws, kept: np.ndarray, rng: np.random.Generator
-) -> Latent:
-    """Compute trust, likelihoods and predictions for given draws.
+def latent_of(source: Source, kept: np.ndarray, rng: np.random.Generator, bar: tqdm) -> Latent:
+    """Compute trust, likelihoods and predictions for all draws.
 
     Args:
-        density: Density of the model given missions.
-        draws: Draws of hyperparameters and coefficients.
-        kept: Indices of the draws whose trust and predicted rates are kept.
+        source: Draws of a model and the missions.
+        kept: Indices of the draws whose trust and predicted rates are kept, in order.
         rng: Random number generator.
+        bar: Progress bar that counts draws.
     """
-    rows = [v.reshape(len(draws.c), -1) for v in draws.theta.values()]
-    _, some, index = np.unique(  # EP draws may repeat, so each distinct draw is evaluated once
-        np.column_stack([*rows, draws.c]), axis=0, return_index=True, return_inverse=True
+    first, place = np.unique(source.first_equal, return_inverse=True)
+    share = np.bincount(place) / source.n_draws
+    shown = first[np.unique(place[kept])]
+
+    mean = np.zeros(source.observations.contact_rate.shape)
+    square = np.zeros(mean.shape)
+    trust = []
+    predicted = []
+    log_likelihood = []
+    log_prior = []
+    for given in source.given(first):
+        rows, log_p, of_prior = source.draw(given, rng)
+        x = source.layout.unstack(rows)
+        weight = share[np.searchsorted(first, given.some)]
+        mean += np.tensordot(weight, x, 1)
+        square += np.tensordot(weight, x**2, 1)
+        log_likelihood.append(log_p)
+        log_prior.append(of_prior)
+
+        is_shown = np.isin(given.some, shown)
+        trust.append(x[is_shown])
+        predicted.append(_rates(source, given, is_shown, rng))
+        bar.update(len(x))
+
+    of_kept = np.searchsorted(shown, first[place[kept]])
+    return Latent(
+        trust=np.concatenate(trust)[of_kept],
+        mean=mean,
+        sd=np.sqrt(np.maximum(square - mean**2, 0.0)),
+        predicted=np.concatenate(predicted)[of_kept],
+        log_likelihood=np.concatenate(log_likelihood)[place],
+        log_prior={n: np.concatenate([part[n] for part in log_prior])[place] for n in log_prior[0]},
     )
-    index = index.ravel()
-    draws = draws.at(some)
-    share = np.bincount(index, minlength=len(some)) / len(index)
-    shown, place = np.unique(index[kept], return_inverse=True)
-
-    shape = density.observations.contact_rate.shape
-    mean = np.zeros(shape)
-    square = np.zeros(shape)
-    log_likelihood = np.empty((len(some), shape[0]))
-    trust = np.empty((len(shown), *shape))
-    predicted = np.empty((len(shown), *shape))
-
-    draw_trust = _exact_trust if density.exact else _ep_trust
-    for where, theta, predictor, expected_predictor in predictors(density, draws):
-        x, log_p = draw_trust(density, theta, predictor, expected_predictor, rng)
-        x = density.layout.unstack(x)
-        mean += np.einsum("n,nmbr->mbr", share[where], x)
-        square += np.einsum("n,nmbr->mbr", share[where], x**2)
-        log_likelihood[where] = log_p.reshape(len(log_p), shape[0], -1).sum(2)
-
-        first, last = np.searchsorted(shown, (where.start, where.start + len(x)))
-        here = shown[first:last] - where.start
-        trust[first:last] = x[here]
-        predicted[first:last] = _rates(density, predictor, expected_predictor, rng)[here]
-
-    sd = np.sqrt(np.maximum(square - mean**2, 0.0))
-    return Latent(trust[place], mean, sd, log_likelihood[index], predicted[place])
 
 
-def replicate(density: Density, draws: JointDraws, rng: np.random.Generator) -> np.ndarray:
+def replicate(source: Source, rng: np.random.Generator) -> np.ndarray:
     """Draw replicated rates (draw, mission, bound, robot) of the missions."""
-    rates = np.empty((len(draws.c), *density.observations.contact_rate.shape))
-    for i, _, predictor, mean in predictors(density, draws):
-        rates[i] = _rates(density, predictor, mean, rng)
-    return rates
+    every = source.given(np.arange(source.n_draws))
+    return np.concatenate([_rates(source, given, slice(None), rng) for given in every])
 
 
-def predictors(
-    density: Density, draws: JointDraws
-) -> Iterator[tuple[slice, Theta, LinearPredictor, np.ndarray]]:
-    """Yield the slice, theta, linear predictors and their means for each chunk of draws."""
-    for where, theta in chunks(draws.theta):
-        density.evaluated(len(theta["inverse_gain"]))
-        predictor = density.model.linear_predictor(theta, density.observations, density.layout)
-        yield where, theta, predictor, expected(density.blocks, predictor, draws.c[where])
-
-
-def _exact_trust(
-    density: Density,
-    theta: Theta,
-    predictor: LinearPredictor,
-    mean: np.ndarray,
-    rng: np.random.Generator,
+def draw_exactly(
+    source: Source, given: Given, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw trust given Gaussian rates; return trust and log-likelihoods (draw, block)."""
-    b = density.blocks
-    S = each(predictor.trust_cov, b.label)
-    W, log_sites = whiten(b, predictor, density.site_precision(predictor))
-    off = b.y - mean
-    w = (W[:, b.kind] @ off[..., None])[..., 0]
+    """Draw trust given Gaussian rates; return trust and log-likelihoods (draw, mission)."""
+    predictor = given.predictor
+    y = source.layout.rows(source.observations.contact_rate)
+    kind, label, seen = kinds_of(y, source.label)
+    S = each(predictor.trust_cov, label)
+    W, log_sites = whiten(label, predictor, seen / each(predictor.noise_sd, label) ** 2)
+    off = np.where(np.isnan(y), 0.0, y) - given.mean
+    w = (W[:, kind] @ off[..., None])[..., 0]
 
     # The normal distribution of trust given the rates; its gain is S (V + 1 / lam)^-1 = S W' W.
     gain = S @ (np.swapaxes(W, 2, 3) @ W)
-    root = _root(S - gain @ S)[:, b.kind]
-    x = mean + (gain[:, b.kind] @ off[..., None])[..., 0]
+    root = root_of(S - gain @ S)[:, kind]
+    x = given.mean + (gain[:, kind] @ off[..., None])[..., 0]
     x += (root @ rng.standard_normal((*x.shape, 1)))[..., 0]
-    return x, log_sites[:, b.kind] - 0.5 * (w**2).sum(2)
+    return x, by_mission(log_sites[:, kind] - 0.5 * (w**2).sum(2), source)
 
 
-def _ep_trust(
-    density: Density,
-    theta: Theta,
-    predictor: LinearPredictor,
-    mean: np.ndarray,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw trust given non-Gaussian rates by weighted particles; see `_exact_trust`."""
-    joint = ep.Joint(density.blocks, predictor, density.prior(theta), density.rates)
-    sites, _ = density.near.at(density.rates, predictor.noise_sd)
-
-    # Draw particles of the predictor f; for each block, Gumbel noise chooses one by weight.
-    drawn = [ep.draw_predictors(joint, mean, sites, rng) for _ in range(_PARTICLES)]
-    f, log_w = (np.stack(part) for part in zip(*drawn, strict=True))
-    chosen = np.argmax(log_w + rng.gumbel(size=log_w.shape), axis=0)
-    f = np.take_along_axis(f, chosen[None, ..., None], axis=0)[0]
-    log_p = logsumexp(log_w, axis=0) - np.log(_PARTICLES)
-
-    if predictor.shared_cov is None:  # the predictor is trust
-        return f, log_p
-
-    # Trust given the predictor f = trust + shared noise.
-    V = each(predictor.covariance, density.blocks.label)
-    S = each(predictor.trust_cov, density.blocks.label)
-    gain = np.swapaxes(np.linalg.solve(V, S), 2, 3)
-    x = mean + (gain @ (f - mean)[..., None])[..., 0]
-    return x + (_root(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p
+def by_mission(of_blocks: np.ndarray, source: Source) -> np.ndarray:
+    """Sum values (draw, block) over the blocks of each mission."""
+    return of_blocks.reshape(len(of_blocks), source.observations.n_missions, -1).sum(2)
 
 
-def _rates(
-    density: Density, predictor: LinearPredictor, mean: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
-    """Draw replicated rates (draw, mission, bound, robot) given the mean linear predictors."""
-    root = each(_root(predictor.covariance), density.blocks.label[density.blocks.kind])
-    f = density.layout.unstack(mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0])
-    sd = density.layout.unstack(np.broadcast_to(predictor.noise_sd, mean.shape))
-    return density.model.likelihood.sample(f, sd, density.observations.n_ticks, rng)
-
-
-def _root(covariance: np.ndarray) -> np.ndarray:
+def root_of(covariance: np.ndarray) -> np.ndarray:
     """Compute Cholesky factors of covariances (..., row, row) that may be nearly singular."""
     n = covariance.shape[-1]
     even = 0.5 * (covariance + np.swapaxes(covariance, -1, -2))
     scale = np.trace(even, axis1=-2, axis2=-1)[..., None, None] / n
     return cholesky(even + (1e-10 * scale + 1e-20) * np.eye(n))
+
+
+def _rates(
+    source: Source, given: Given, index: np.ndarray | slice, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw replicated rates (draw, mission, bound, robot) for some of the given draws."""
+    predictor = given.predictor.take(index)
+    mean = given.mean[index]
+    root = each(root_of(predictor.covariance), source.label)
+    f = mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0]
+    sd = np.broadcast_to(each(predictor.noise_sd, source.label), f.shape)
+
+    unstack = source.layout.unstack
+    n_ticks = source.observations.n_ticks
+    return source.likelihood.sample(unstack(f), unstack(sd), n_ticks, rng)

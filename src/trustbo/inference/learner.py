@@ -12,6 +12,7 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_kind, see
+from trustbo.inference.classes import OfClass
 from trustbo.inference.draws import (
     as_fitted,
     in_order_of_features,
@@ -30,7 +31,6 @@ from trustbo.inference.functions.fit import (
     require_learnable,
     require_plannable,
     require_poolable_with_function,
-    with_latent_of_function,
 )
 from trustbo.inference.functions.function import (
     FunctionModel,
@@ -40,6 +40,8 @@ from trustbo.inference.functions.function import (
 )
 from trustbo.inference.functions.sampling import NUTS
 from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
+from trustbo.inference.functions.source import FunctionData, OfFunction
+from trustbo.inference.latent import Source
 from trustbo.inference.tree import parameters_alone, with_latent
 from trustbo.models.default import default_model
 from trustbo.models.draws import Draws
@@ -117,12 +119,15 @@ class Learner:
         """Raise TrustboError if the model cannot be fitted to missions of earlier campaigns."""
         require_poolable_with_model(self.known, earlier, workspace.team.names)
 
-    def with_latent(
-        self, posterior: xr.DataTree, missions: Sequence[Mission], progress: bool
-    ) -> xr.DataTree:
-        """Add the groups of `add_latent`, given missions in the order of the posterior."""
-        fitted, draws = read_posterior(posterior, missions, model=self.model)
-        return with_latent(posterior, missions, fitted, draws, progress=progress)
+    def source(
+        self, posterior: xr.DataTree, missions: Sequence[Mission], *, contrasts: bool = True
+    ) -> Source:
+        """Return all draws of a posterior, with missions in the order of its features.
+
+        Blocks may be contrasts of robots unless `contrasts` is false.
+        """
+        found = read_posterior(posterior, missions, model=self.model)
+        return OfClass(*found, contrasts=contrasts)
 
     def read(
         self, posterior: xr.DataTree, workspace: Workspace | None, next_mission: Sequence[bool]
@@ -160,11 +165,11 @@ class FunctionLearner(Learner):
         """See `Learner.require_poolable`."""
         require_poolable_with_function(self.model, earlier, workspace.team.names)
 
-    def with_latent(
-        self, posterior: xr.DataTree, missions: Sequence[Mission], progress: bool
-    ) -> xr.DataTree:
-        """See `Learner.with_latent`."""
-        return with_latent_of_function(posterior, missions, self.model, progress=progress)
+    def source(
+        self, posterior: xr.DataTree, missions: Sequence[Mission], *, contrasts: bool = True
+    ) -> Source:
+        """See `Learner.source`; there are no contrasts."""
+        return OfFunction.stored(FunctionData(self.model, missions), posterior)
 
     def read(
         self, posterior: xr.DataTree, workspace: Workspace | None, next_mission: Sequence[bool]
@@ -322,5 +327,5 @@ def add_latent(
 
     missions = missions_of(posterior) if missions is None else missions
     missions = in_order_of_features(missions, posterior)
-    learner = learner_of_posterior(posterior, model)
-    return learner.with_latent(posterior, missions, progress)
+    source = learner_of_posterior(posterior, model).source(posterior, missions)
+    return with_latent(posterior, missions, source, progress=progress)

@@ -10,9 +10,9 @@ from scipy.special import softmax
 from trustbo.arrays import evenly_spaced
 from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_choice, require_count, require_whole
+from trustbo.inference.classes import OfClass
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.draws import QUANTILES, as_fitted, is_of_people, read_posterior
-from trustbo.inference.latent import predictors
 from trustbo.models.families import Family
 from trustbo.models.model import TrustModel
 from trustbo.parallel import computing
@@ -146,12 +146,13 @@ def _ahead(density: Density, draws: JointDraws, earlier: bool) -> kalman.Ahead:
     ticks = layout.rows(observations.n_ticks)
 
     parts = []
-    for where, _, predictor, mean in predictors(density, draws):
-        cov = each(predictor.covariance, density.blocks.label)
-        sd = draws.theta["delta_v"][where, None, None]
+    source = OfClass(density, draws)
+    for given in source.given(np.arange(source.n_draws)):
+        cov = each(given.predictor.covariance, source.label)
+        sd = draws.theta["delta_v"][given.some, None, None]
         parts.append(
             kalman.one_step_ahead(
-                mean, cov, sd, y, ticks, density.model.likelihood, observations.n_robots
+                given.mean, cov, sd, y, ticks, source.likelihood, observations.n_robots
             )
         )
     joined = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))

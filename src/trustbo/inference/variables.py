@@ -4,38 +4,23 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from trustbo.inference.columns import Groups
 from trustbo.inference.density import Density, JointDraws, chunks
 from trustbo.inference.engine import Prior
 from trustbo.models.effects.effect import Theta
 
 
 def to_variables(density: Density, draws: JointDraws) -> dict[str, dict[str, np.ndarray]]:
-    """Return the variables of draws by group (`posterior` and one per effect) and name.
-
-    Effects are stored in single precision, because they take most of the memory of a posterior and
-    the error is far below their Monte Carlo error. Computations read them in double precision.
-    """
-    theta = draws.theta
-    groups = {"posterior": _hyperparameters(density, theta)}
-    ends = zip(density.ends[:-1], density.ends[1:], strict=True)
-    for effect, (start, end) in zip(density.model.terms, ends, strict=True):
-        own = draws.c[:, start:end].copy()  # a view would keep all columns in memory
-        of_effect = effect.to_variables(own, theta, density.observations)
-        if effect.group:
-            of_effect = {name: v.astype(np.float32) for name, v in of_effect.items()}
-        groups.setdefault(effect.group or "posterior", {}).update(of_effect)
+    """Return the variables of draws by group (`posterior` and one per effect) and name."""
+    groups = density.columns.to_variables(draws.c, draws.theta)
+    groups["posterior"] = _hyperparameters(density, draws.theta) | groups["posterior"]
     return groups
 
 
-def draws_of(density: Density, groups: Mapping[str, Mapping[str, np.ndarray]]) -> JointDraws:
+def draws_of(density: Density, groups: Groups) -> JointDraws:
     """Make draws from variables by group and name, as returned by `to_variables`."""
     theta = _theta_of(density, groups["posterior"])
-    c = []
-    for effect in density.model.terms:
-        stored = groups[effect.group or "posterior"]
-        values = {name: np.asarray(v, dtype=float) for name, v in stored.items()}
-        c.append(effect.coefficients(values, theta, density.observations))
-    return JointDraws(theta, np.column_stack(c))
+    return JointDraws(theta, density.columns.coefficients(groups, theta))
 
 
 def with_prior_effects(
@@ -43,16 +28,11 @@ def with_prior_effects(
 ) -> JointDraws:
     """Draw the effects from their prior given prior draws of the parameters, by name."""
     theta = _theta_of(density, parameters)
-    observations = density.observations
-    model = density.model
+    c = np.concatenate([density.prior(chunk).draw(rng) for _, chunk in chunks(theta)])
 
-    weights = model.weights.coefficients(parameters, theta, observations)
-    parts = []
-    for where, chunk in chunks(theta):
-        groups = [effect.prior(chunk, observations) for effect in model.effects]
-        of_effects = Prior.from_groups(groups).draw(rng) if groups else weights[where, :0]
-        parts.append(of_effects)
-    return JointDraws(theta, np.column_stack([weights, np.concatenate(parts)]))
+    weights = density.model.weights.coefficients(parameters, theta, density.observations)
+    c[:, : weights.shape[1]] = weights  # the parameters include them
+    return JointDraws(theta, c)
 
 
 def _theta_of(density: Density, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -76,10 +56,8 @@ def prior_parameters(
 
     weights = Prior.from_groups([model.weights.prior(theta, observations)])
     c = weights.mean if even else weights.draw(rng)
-    return {
-        **_hyperparameters(density, theta),
-        **model.weights.to_variables(c, theta, observations),
-    }
+    of_weights = model.weights.to_variables(c, theta, observations)
+    return {**_hyperparameters(density, theta), **of_weights}
 
 
 def _hyperparameters(density: Density, theta: Theta) -> dict[str, np.ndarray]:

@@ -181,6 +181,16 @@ class LinearPredictor(NamedTuple):
             return self.trust_cov
         return self.trust_cov + self.shared_cov
 
+    def take(self, index: Any) -> Self:
+        """Select points by an index array, a mask or a slice."""
+        return type(self)(*(None if value is None else value[index] for value in self))
+
+    def mean_given(self, inputs: Any, label: np.ndarray) -> Any:
+        """Compute the mean (point, block, row) given inputs (point, block, input) of all blocks."""
+        if self.response.shape[1] == 1:  # one product for all blocks is faster
+            return each(self.mean, label) + inputs @ np.swapaxes(self.response[:, 0], 1, 2)
+        return each(self.mean, label) + (self.response[:, label] @ inputs[..., None])[..., 0]
+
 
 def each(M: Any, label: np.ndarray) -> Any:
     """Select values (point, block, ...) by block label; a block axis of length 1 is kept."""

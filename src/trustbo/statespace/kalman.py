@@ -4,7 +4,7 @@ All functions are pure and take the parameters as a `StateSpace`. They work in N
 they draw random numbers, in JAX.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -239,54 +239,6 @@ def forecast(
         belief = predict(space, belief, of_bound)
         drawn, rates = simulate(space, drawn, of_bound, ticks, likelihood, rng)
         yield belief, rates
-
-
-def draw_trust(
-    space: StateSpace,
-    inputs: Sequence[Inputs],
-    rates: np.ndarray,
-    n_groups: int,
-    rng: np.random.Generator,
-) -> np.ndarray:
-    """Draw trust in all bounds of a mission given its Gaussian rates.
-
-    The filter runs forwards, and trust is drawn backwards (Carter and Kohn 1994, Biometrika 81).
-    Given the state d' after the next bound, the state d before it is normal:
-
-    G = P A' P'^-1,    E[d] = m + G (d' - m'),    cov(d) = P - G P' G'
-
-    where (m, P) is filtered, and (m', P') is predicted for the next bound.
-
-    Args:
-        space: Parameters.
-        inputs: Inputs (point, group, member) of each bound.
-        rates: Contact rates (bound, group, member); NaN where not measured.
-        n_groups: Number of groups of robots.
-        rng: Random number generator.
-
-    Returns:
-        Trust, shape (point, bound, group, member).
-    """
-    belief = initial(space, n_groups)
-    predicted = []
-    filtered = []
-    for of_bound, y in zip(inputs, rates, strict=True):
-        predicted.append(predict(space, belief, of_bound))
-        no_ticks = y  # any array of this shape
-        belief, _ = update(space, predicted[-1], y, no_ticks, GaussianRates())
-        filtered.append(belief)
-
-    trust = [draw(filtered[-1], rng).mean]
-    for k in reversed(range(len(filtered) - 1)):
-        now = filtered[k]
-        ahead = predicted[k + 1]
-        of_next = product(space.transition, now.cov)
-        gain = transpose(np.linalg.solve(ahead.cov, of_next))
-        mean = now.mean + apply(gain, trust[-1] - ahead.mean)
-        cov = now.cov - product(product(gain, ahead.cov), transpose(gain))
-        trust.append(mean + _noise(0.5 * (cov + transpose(cov)), rng))
-
-    return np.stack(trust[::-1], axis=1)
 
 
 def gaussian_match(y: Any, mean: Any, var: Any, sd: Any) -> tuple[Any, Any, Any]:

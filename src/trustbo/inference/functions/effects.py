@@ -5,12 +5,12 @@ jointly normal. The coefficients are therefore integrated out, as in model class
 variables are sampled, and are drawn afterwards.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from scipy import sparse
 
 from trustbo.data import Mission
+from trustbo.inference.columns import Columns
 from trustbo.inference.density import chunks
 from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, evidence
 from trustbo.models.effects.effect import Effect, Theta
@@ -24,13 +24,8 @@ _LEAST_NOISE = 1e-8
 """Smallest standard deviation of a rate's own noise with which the density is computed."""
 
 
-class AddedEffects:
-    """Effects that a function adds to the drift in some missions.
-
-    Attributes:
-        effects: The effects.
-        observations: Rates and awareness of the missions, with the data that the effects need.
-    """
+class AddedEffects(Columns):
+    """Effects that a function adds to the drift in some missions; there may be none."""
 
     def __init__(
         self,
@@ -52,14 +47,9 @@ class AddedEffects:
         """
         for effect in effects:
             observations = effect.add_data(observations, missions, workspace)
-        self.effects = tuple(effects)
-        self.observations = observations
+        super().__init__(effects, observations)
 
-        designs = [effect.design(observations) for effect in effects]
-        self._ends = np.cumsum([0, *(U.shape[1] for U in designs)])
-        self._U = sparse.csr_array(sparse.hstack(designs, format="csr"))
-        self._known: tuple[Layout, Blocks] | None = None  # see `_blocks`
-
+        self._blocks: Blocks | None = None  # the same at all points
         self._log_resolution = 0.0
         of_ticks = FAMILIES["gaussian"].log_resolution(
             observations.contact_rate, observations.n_ticks
@@ -95,70 +85,41 @@ class AddedEffects:
     ) -> dict[str, dict[str, np.ndarray]]:
         """Draw the variables (draw, ...) of each effect given the rates, by group and name.
 
-        The arguments have the axis (draw,); see `log_evidence`. As in model classes, effects are
-        stored in single precision.
+        The arguments have the axis (draw,); see `log_evidence`.
         """
         parts = []
         for where, chunk in chunks(theta):
             fit, prior = self._fit(space.take(where), drift[where], chunk)
             mean, deviation, _ = coefficients_of(prior, fit, 1, rng)
             parts.append(mean + deviation[:, 0])
-        return self._variables(np.concatenate(parts), theta)
-
-    def sum_of(self, values: Mapping[str, Mapping[str, np.ndarray]], theta: Theta) -> np.ndarray:
-        """Compute the sum (draw, mission, bound, robot) of effects, given by group and name."""
-        c = [
-            effect.coefficients(values[effect.group], theta, self.observations)
-            for effect in self.effects
-        ]
-        return self._sum(np.concatenate(c, axis=1))
-
-    def sum_of_prior(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
-        """Draw the sum (draw, mission, bound, robot) of the effects from the prior."""
-        parts = [self._prior(chunk).draw(rng) for _, chunk in chunks(theta)]
-        return self._sum(np.concatenate(parts))
-
-    def _sum(self, c: np.ndarray) -> np.ndarray:
-        """Compute the sum (draw, mission, bound, robot) for coefficients c (draw, column)."""
-        return (self._U @ c.T).T.reshape(len(c), *self.observations.contact_rate.shape)
-
-    def _variables(self, c: np.ndarray, theta: Theta) -> dict[str, dict[str, np.ndarray]]:
-        """Return the variables of coefficients c (draw, column), by group and name."""
-        variables = {}
-        ends = zip(self._ends[:-1], self._ends[1:], strict=True)
-        for effect, (start, end) in zip(self.effects, ends, strict=True):
-            found = effect.to_variables(c[:, start:end].copy(), theta, self.observations)
-            variables[effect.group] = {name: v.astype(np.float32) for name, v in found.items()}
-        return variables
-
-    def _prior(self, theta: Theta) -> Prior:
-        """Return the prior on the coefficients at each theta."""
-        return Prior.from_groups(
-            [effect.prior(theta, self.observations) for effect in self.effects]
-        )
+        return self.to_variables(np.concatenate(parts), theta)
 
     def _fit(self, space: StateSpace, drift: np.ndarray, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence at each point; also return the prior."""
-        prior = self._prior(theta)
-        layout, blocks = self._blocks(space, prior)
+        rates = self.observations.contact_rate
+        prior = self.prior(theta)
+        layout, label = layout_of(space, rates)
+        if self._blocks is None:
+            U = layout.design(self.U)
+            self._blocks = Blocks.from_rows(layout.rows(rates), U, label, prior=prior)
+        blocks = self._blocks
         predictor = LinearPredictor.from_space(space, layout)
 
         # The drift of the function is known, so its mean contribution is taken off the rates.
         u = layout.rows(drift)
-        known = (each(predictor.response, blocks.label[blocks.kind]) @ u[..., None])[..., 0]
+        known = (each(predictor.response, label) @ u[..., None])[..., 0]
         precision = blocks.seen / each(predictor.noise_sd, blocks.label) ** 2
         return evidence(blocks, predictor, prior, precision, blocks.y - known), prior
 
-    def _blocks(self, space: StateSpace, prior: Prior) -> tuple[Layout, Blocks]:
-        """Return the layout and the blocks of the rates, which are the same at all points."""
-        if self._known is None:
-            is_joint = space.n_members > 1
-            layout = Layout.from_rates(self.observations.contact_rate, joint=is_joint)
-            n_groups = space.transition.shape[1]
-            label = layout.label
-            if n_groups > 1:  # robots with parameters of their own
-                label = np.tile(np.arange(n_groups), self.observations.n_missions)
-            y = layout.rows(self.observations.contact_rate)
-            blocks = Blocks.from_rows(y, layout.design(self._U), label, prior=prior)
-            self._known = layout, blocks
-        return self._known
+
+def layout_of(space: StateSpace, rates: np.ndarray) -> tuple[Layout, np.ndarray]:
+    """Return the blocks of rates (mission, bound, robot), and the label (block,) of each block.
+
+    Blocks have equal labels if the form has equal parameters for them.
+    """
+    layout = Layout.from_rates(rates, joint=space.n_members > 1)
+    n_groups = max(field.shape[1] for field in space if field is not None)
+    label = layout.label
+    if n_groups > 1:  # robots with parameters of their own
+        label = np.tile(np.arange(n_groups), len(rates))
+    return layout, label

@@ -76,8 +76,6 @@ class Found(NamedTuple):
     """Log prior density of each element of each variable, in the shape of its plates."""
     log_likelihood: Any
     """Log density of each mission's rates, or log probability of its counts, shape (mission,)."""
-    of_counts: Any
-    """Whether `log_likelihood` refers to tick counts if every rate has one."""
 
 
 class Outer(NamedTuple):
@@ -213,15 +211,18 @@ class FunctionModel:
         is_plain = is_plain and all(isinstance(one, ExpTransform) for one in maps)
         return (names[0], names[1]) if is_plain else None
 
+    def rates(self, data: Data) -> ContactRate:
+        """Return the distribution of the rates; its arrays have shapes, but no values."""
+        trace, _ = self._shapes(data)
+        return trace[RATES]["fn"]
+
     def effects(self, data: Data) -> tuple[Effect, ...]:
         """Return the effects that the function adds to the drift."""
-        trace, _ = self._shapes(data)
-        return trace[RATES]["fn"].effects
+        return self.rates(data).effects
 
     def resolution(self, data: Data) -> float:
         """Return the resolution of rates that the function adds to its noise, or 0."""
-        trace, _ = self._shapes(data)
-        if not trace[RATES]["fn"].adds_resolution:
+        if not self.rates(data).adds_resolution:
             return 0.0
         is_measured = ~np.isnan(data[RATES])
         return float(median_resolution(np.where(is_measured, data["n_ticks"], 0.0)))
@@ -554,7 +555,6 @@ class FunctionModel:
                 name: trace[name]["fn"].log_prob(trace[name]["value"]) for name in latent_in(trace)
             },
             log_likelihood=rates.log_prob(trace[RATES]["value"]),
-            of_counts=jnp.asarray(rates.n_ticks is not None),
         )
 
     def probe(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> Probe:

@@ -27,6 +27,7 @@ from trustbo.inference.functions.nuts import (
     require_gradient,
 )
 from trustbo.inference.functions.sites import Site, safe
+from trustbo.inference.options import Options
 from trustbo.models.backend import own_settings
 from trustbo.statespace import StateSpace
 from trustbo.streams import stream
@@ -203,52 +204,40 @@ def targets_of(
 
 
 def sampled(
-    targets: Sequence[Target],
-    prior: Mapping[str, np.ndarray],
-    previous: xr.DataTree | None,
-    sampler: str,
-    *,
-    chains: int,
-    draws: int,
-    warmup: int | None,
-    seed: int,
-    progress: bool,
-    check: bool,
+    targets: Sequence[Target], prior: Mapping[str, np.ndarray], draws: int, options: Options
 ) -> Drawn:
     """Sample a posterior by importance sampling, or by NUTS where this fails.
 
     Args:
         targets: The posterior in all coordinates; see `targets_of`.
         prior: Values (draw, ...) of the variables, drawn from the prior.
-        previous: Posterior of the same function given similar data, or None.
-        sampler: One of `SAMPLERS`.
-        chains: Number of chains of NUTS.
         draws: Number of draws per chain; importance sampling draws as many in one chain.
-        warmup: Number of warm-up draws per chain.
-        seed: Random seed.
-        progress: Whether to show progress bars after 1.5 seconds.
-        check: Whether NUTS is continued until its diagnostics are good.
+        options: Other options.
     """
     target = targets[0]
-    known = _values_of(previous, target, seed)
+    sampler = options.sampler
+    seed = options.seed
+    known = _values_of(options.start, target, seed)
     found = None
     if sampler != NUTS or known is None:  # also for the starts of NUTS
         starts = [prior] if known is None else [known, prior]
-        with slow_bar("fit", " points", progress) as bar:
+        with slow_bar("fit", " points", options.progress) as bar:
             charts = [_chart(one, target, starts, bar) for one in targets]
             found = mixtures.sample(charts, seed, target.coordinates.names)
         has_effects = target.effects is not None  # these have no gradient
         if sampler == IMPORTANCE or has_effects or (sampler == AUTO and not found.complaints):
-            return _resampled(target, found, chains * draws, seed)
+            return _resampled(target, found, options.chains * draws, seed)
 
     require_gradient(target.model, target.coordinates, target.data)
     if found is None:
         x = target.finite_points(known or prior)
     else:
         x = found.x[found.resample(_N_STARTS, stream(seed, "starts of chains"))]
-    start = Start.near(x, chains, seed)
-    warmup = _WARMUP if warmup is None else warmup
-    return _by_nuts(target, start, warmup, draws, seed=seed, progress=progress, check=check)
+    start = Start.near(x, options.chains, seed)
+    warmup = _WARMUP if options.warmup is None else options.warmup
+    return _by_nuts(
+        target, start, warmup, draws, seed=seed, progress=options.progress, check=options.check
+    )
 
 
 def _chart(
