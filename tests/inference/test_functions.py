@@ -1,12 +1,8 @@
 """Models that are NumPyro functions: what they compute, how they are fitted, what is refused."""
 
 import functools
-import io
-import os
 import subprocess
 import sys
-import threading
-from contextlib import redirect_stdout
 
 import arviz as az
 import jax
@@ -28,7 +24,6 @@ from trustbo.errors import PosteriorError, TrustboError
 from trustbo.inference import params_of
 from trustbo.inference.functions.data import data_of
 from trustbo.inference.functions.function import as_model, model_of_record
-from trustbo.inference.functions.identity import constants_of, fingerprint
 from trustbo.inference.functions.nuts import Samples
 from trustbo.inference.functions.sampling import _judge as judge
 from trustbo.inference.functions.sampling import targets_of
@@ -297,23 +292,6 @@ def test_a_constant_that_differs_is_named(stored, given, message):
         return
     with pytest.raises(tb.TrustboError, match=message):
         model_of_record(record, model)
-
-
-def test_constants_are_those_of_all_functions_that_are_called():
-    def helper(x, scale=2.0):
-        return scale * x + GLOBAL
-
-    def outer(awareness, contact_rate=None):
-        return helper(awareness)
-
-    before = constants_of(outer)
-    assert set(before) == {"contact_rate", "scale", "GLOBAL"}
-    helper.__defaults__ = (3.0,)
-    after = constants_of(outer)
-    assert [name for name in before if before[name] != after[name]] == ["scale"]
-
-
-GLOBAL = 1.0
 
 
 def other(awareness, contact_rate=None):
@@ -766,15 +744,6 @@ def test_other_samplers_are_refused(missions):
         tb.fit(missions, linear, sampler="gibbs")
 
 
-def scaled(scale):
-    def model(awareness, contact_rate=None):
-        a = numpyro.sample("a", dist.Normal(0.0, scale))
-        rates = ContactRate(a + awareness[..., 0], 0.5, 0.1, 0.1)
-        numpyro.sample("contact_rate", rates, obs=contact_rate)
-
-    return model
-
-
 def test_a_guard_against_transfers_does_not_stop_a_function(missions):
     model = as_model(linear)
     data = data_of(missions, Observations.from_missions(missions))
@@ -784,204 +753,6 @@ def test_a_guard_against_transfers_does_not_stop_a_function(missions):
     with jax.transfer_guard("disallow"):
         drawn = model.over_draws("prior", 1, data)(keys)
     assert drawn["weight"].shape == (2, 2)
-
-
-def test_a_fingerprint_tells_functions_apart_but_not_their_comments():
-    assert fingerprint(scaled(1.0)) == fingerprint(scaled(1.0))
-    assert fingerprint(scaled(1.0)) != fingerprint(scaled(2.0))
-    assert fingerprint(linear) != fingerprint(by_mission)
-    assert fingerprint(PooledTrust().program) != fingerprint(
-        PooledTrust(memory="deviation").program
-    )
-    assert fingerprint(functools.partial(shaped, n=3)) != fingerprint(
-        functools.partial(shaped, n=2)
-    )
-    assert as_model(linear) is as_model(linear)
-
-
-def closed(*values):
-    return lambda awareness, contact_rate=None: values
-
-
-def inner(awareness, contact_rate=None):
-    return jax.vmap(lambda z: SCALES["slope"] * z)(awareness)
-
-
-def jitted(factor):
-    return jax.jit(lambda awareness, contact_rate=None: factor * awareness)
-
-
-class Callable:
-    def __init__(self, n):
-        self.n = n
-
-    def __call__(self, awareness, contact_rate=None):
-        return self.n
-
-
-def first_wrapped(awareness, contact_rate=None):
-    return awareness + 1.0
-
-
-def second_wrapped(awareness, contact_rate=None):
-    return awareness + 2.0
-
-
-@pytest.mark.parametrize(
-    ("one", "other"),
-    [
-        (closed(1, 2, 1), closed(1, 2, 2)),
-        (closed(dist.Normal(0.0, 1.0)), closed(dist.Normal(0.0, 2.0))),
-        (closed(lambda x: x), closed(lambda x: 2.0 * x)),
-        (functools.partial(shaped, n=max), functools.partial(shaped, n=min)),
-        (functools.partial(shaped, a=lambda x: x), functools.partial(shaped, b=lambda x: x)),
-        (jitted(1.0), jitted(2.0)),
-        (Callable(1), Callable(2)),
-        (reparam(config={})(first_wrapped), reparam(config={})(second_wrapped)),
-        (reparam(first_wrapped, config={}), reparam(second_wrapped, config={})),
-    ],
-)
-def test_a_fingerprint_contains_what_a_function_refers_to(one, other):
-    assert fingerprint(one) != fingerprint(other)
-
-
-SCALES = {"slope": 1.0}
-PRIOR = dist.Normal(0.0, 1e-3)
-
-
-def with_global_prior(awareness, contact_rate=None):
-    a = numpyro.sample("a", PRIOR)
-    rates = ContactRate(a + 0.0 * awareness[..., 0], 0.4, 0.05, 0.05)
-    numpyro.sample("contact_rate", rates, obs=contact_rate)
-
-
-class Saturating:
-    """A function with a setting beside attributes that cannot be pickled."""
-
-    def __init__(self, steepness):
-        self.steepness = steepness
-        self.link = jnp.tanh
-        self.lock = threading.Lock()
-        self.own = self
-
-    def __call__(self, awareness, contact_rate=None):
-        return self.link(self.steepness * awareness)
-
-    def method(self, awareness, contact_rate=None):
-        return self(awareness)
-
-
-class Slotted:
-    __slots__ = ("link", "steepness")
-
-    def __init__(self, steepness):
-        self.steepness = steepness
-        self.link = jnp.tanh
-
-    def __call__(self, awareness, contact_rate=None):
-        return self.link(self.steepness * awareness)
-
-
-@pytest.mark.parametrize(
-    "of",
-    [Saturating, Slotted, lambda steepness: Saturating(steepness).method],
-    ids=["call", "slots", "method"],
-)
-def test_attributes_that_cannot_be_pickled_do_not_hide_the_others(of):
-    assert fingerprint(of(1.0)) == fingerprint(of(1.0)) != fingerprint(of(20.0))
-
-
-def with_link(power):
-    class Link:
-        def __call__(self, x):
-            return x**power
-
-    return lambda awareness, contact_rate=None: Link()(awareness)
-
-
-def test_a_class_of_the_same_module_that_changes_changes_the_fingerprint():
-    assert fingerprint(with_link(1)) == fingerprint(with_link(1)) != fingerprint(with_link(2))
-
-
-def halved(x, n):
-    return halved(0.5 * x, n - 1) if n else x
-
-
-def test_a_function_that_calls_itself_has_a_fingerprint(monkeypatch):
-    before = fingerprint(halved)
-    assert fingerprint(halved) == before
-    monkeypatch.setattr(halved, "__defaults__", (3,))
-    assert fingerprint(halved) != before
-
-
-def test_an_object_that_changes_changes_its_fingerprint():
-    model = Saturating(1.0)
-    before = fingerprint(model)
-    model.steepness = 20.0
-    assert fingerprint(model) != before
-    model.steepness = 1.0
-    model.link = jnp.sin
-    assert fingerprint(model) != before
-
-
-def test_globals_that_change_change_the_fingerprint(monkeypatch):
-    before = fingerprint(inner), fingerprint(with_global_prior)
-    monkeypatch.setitem(SCALES, "slope", 2.0)
-    assert fingerprint(inner) != before[0]
-
-    model = as_model(with_global_prior)
-    monkeypatch.setitem(globals(), "PRIOR", dist.Normal(0.0, 1.0))
-    assert fingerprint(with_global_prior) != before[1]
-    assert as_model(with_global_prior) is not model  # not what was compiled with the old prior
-
-
-def test_a_fingerprint_is_the_same_in_other_processes():
-    """Of a function without source, of sets, and of texts in arrays, whatever the hash seed is."""
-    script = (
-        "from types import SimpleNamespace\n"
-        "from trustbo.inference.functions.identity import fingerprint as f\n"
-        "space = {}\n"
-        "made = 'def m(awareness, contact_rate=None): return (lambda x: x)(1)'\n"
-        "exec(compile(made, '<made>', 'exec'), space)\n"
-        "names = {'slope', 'openness', 'roughness', 'sight'}\n"
-        "settings = SimpleNamespace(names=names)\n"
-        "def closed(v): return lambda awareness, contact_rate=None: v\n"
-        "literal = lambda awareness, contact_rate=None: awareness in {'slope', 'tri', 'sight'}\n"
-        "import numpy as np\n"
-        "texts = [np.array(['slope', text], dtype=object) for text in ('tri', 'sight')]\n"
-        "print(f(space['m']), f(closed(names)), f(closed(settings)), f(literal),"
-        " f(closed({*names, 'tri'})), *(f(closed(one)) for one in texts))"
-    )
-    with redirect_stdout(io.StringIO()) as here:
-        exec(script, {"__name__": "__main__"})
-    space = os.environ | {"PYTHONHASHSEED": "1"}  # it is 0 here
-    command = [sys.executable, "-c", script]
-    there = subprocess.run(command, capture_output=True, text=True, check=True, env=space).stdout
-    assert here.getvalue() == there
-    assert len({*there.split()}) == 7
-
-
-def test_a_fingerprint_does_not_change_when_an_object_is_used():
-    """A workspace caches properties, and xarray caches accessors."""
-    made = [
-        tb.Workspace.from_awareness(np.full((3, 4, 4, 1), z), features=("visibility",))
-        for z in (0.5, 0.5, 0.6)
-    ]
-
-    def of(workspace):
-        return lambda awareness, contact_rate=None: workspace.features.index("visibility")
-
-    before = [fingerprint(of(one)) for one in made]
-    assert before[0] == before[1] != before[2]
-    tb.Planner(made[0], (3, 0), (0, 3)).plan(TrustParams(0.4, np.array([0.2]), 0.0, 0.1, 0.1))
-    assert fingerprint(of(made[0])) == before[0]
-
-
-def test_a_fingerprint_tells_random_keys_apart():
-    keys = [jax.random.key(0), jax.random.key(1)]
-    assert fingerprint(closed(keys[0])) != fingerprint(closed(keys[1]))
-    seeded = [numpyro.handlers.seed(first_wrapped, key) for key in keys]
-    assert fingerprint(seeded[0]) != fingerprint(seeded[1])
 
 
 def test_log_priors_of_missions_leave_out_the_padding(with_days):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import threading
 import types
 from functools import partial
 
@@ -15,6 +16,7 @@ from trustbo.errors import TrustboError
 from trustbo.models.backend import VERSIONS
 from trustbo.simulation import Truth
 from trustbo.study import Scene, run_grid
+from trustbo.study.grid import _hash_of as hash_of
 
 POOLED = tb.models.PooledTrust()
 CASES = {"greedy": {"model": POOLED}, "random": {"model": POOLED, "policy": "random"}}
@@ -92,6 +94,24 @@ def test_stored_runs_of_an_edited_case_are_refused(table, folder):
     edited = CASES | {"random": CASES["random"] | {"model": tb.models.PooledTrust(priors)}}
     with pytest.raises(TrustboError, match="hash of case"):
         run_grid(edited, SCENES, folder, seeds=(0, 1), n_missions=2)
+
+
+def test_earlier_campaigns_count_as_their_missions():
+    where = scene(0)
+    with tb.Campaign(where.workspace, (2, 0), (0, 2), model=POOLED) as campaign:
+        for _ in campaign.run(where.simulator, 1):
+            before = hash_of("own", {"earlier": [campaign]})
+            campaign.planner  # noqa: B018  (which the campaign keeps)
+            assert hash_of("own", {"earlier": [campaign]}) == before
+        campaign.tell(where.simulator.run(campaign.ask().path, seed=1))
+        assert hash_of("own", {"earlier": [campaign]}) != before
+
+
+def test_values_that_no_other_process_can_get_are_refused(tmp_path):
+    case = {"own": {"model": POOLED, "reporter": threading.Lock()}}
+    with pytest.raises(TrustboError, match="n_jobs"):
+        run_grid(case, SCENES, tmp_path / "out", n_jobs=2)
+    assert not (tmp_path / "out").exists()
 
 
 def test_stored_runs_of_an_edited_scene_are_refused(table, folder):

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
+from pickle import PicklingError
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -14,13 +15,14 @@ from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
 from trustbo.campaign.campaign import Campaign
+from trustbo.campaign.result import Result
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, composed, require_count
 from trustbo.files import FilePath, interpreting, to_path, write_text
+from trustbo.inference.functions.identity import fingerprint
 from trustbo.models.backend import VERSIONS
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
-from trustbo.study.identity import identity_of
 from trustbo.workspace import Workspace
 
 _N_SHOWN = 3
@@ -107,8 +109,8 @@ def run_grid(
         learning, without the evaluation of the paths.
 
     Raises:
-        TrustboError: A run failed (call the function again to repeat failed runs), or a stored run
-            is of another case, scene or version.
+        TrustboError: A run failed (call the function again to repeat failed runs), a stored run is
+            of another case, scene or version, or a case or scene cannot be sent to other processes.
 
     Example:
         >>> cases = {"default": {}, "thompson": {"policy": "thompson"}}
@@ -117,8 +119,8 @@ def run_grid(
     """
     require_count("n_missions", n_missions)
     # Here and not in a worker process, so that a hash does not depend on how its code was sent.
-    of_cases = {name: identity_of(name, case) for name, case in cases.items()}
-    of_scenes = {name: identity_of(name, scene) for name, scene in scenes.items()}
+    of_cases = {name: _hash_of(name, case) for name, case in cases.items()}
+    of_scenes = {name: _hash_of(name, scene) for name, scene in scenes.items()}
 
     root = to_path(folder)
     runs = []
@@ -143,11 +145,17 @@ def run_grid(
     for run in runs:
         if run.file.exists():
             _read(run)  # refused before other runs begin
-    errors = Parallel(n_jobs=n_jobs)(
-        delayed(_try)(cases[run.case], scenes[run.scene], run, n_missions)
-        for run in runs
-        if not run.file.exists()
-    )
+    try:
+        errors = Parallel(n_jobs=n_jobs)(
+            delayed(_try)(cases[run.case], scenes[run.scene], run, n_missions)
+            for run in runs
+            if not run.file.exists()
+        )
+    except PicklingError as error:
+        raise TrustboError(
+            "a case or scene contains a value that cannot be sent to other processes; make it in "
+            "the function of the scene, or use n_jobs=1."
+        ) from error
 
     failed = [error for error in errors if error]
     if failed:
@@ -156,6 +164,11 @@ def run_grid(
             f"first errors are: {'; '.join(failed[:_N_SHOWN])}"
         )
     return pd.concat(map(_read, runs), ignore_index=True)
+
+
+def _hash_of(name: str, value: Any) -> str:
+    """Return a hash of a named case or scene; earlier campaigns count as their missions."""
+    return fingerprint((name, value), {Result: lambda result: result.missions})
 
 
 def _plain(name: str) -> str:
