@@ -198,7 +198,8 @@ def _pictures(result: Result) -> dict[str, str]:
         "sd": lambda: plots.cell_map(sd, result.workspace, path=plan.path),
     }
     if plan.stops is not None:
-        weakest = bounds_of(result).nsmallest(_SHOWN, "contact").index
+        bounds = bounds_of(result).iloc[1:]
+        weakest = bounds.nsmallest(_SHOWN, "contact").index
         draw["path"] = lambda: plots.plan_map(plan, bounds=[])
         draw["weakest"] = lambda: plots.plan_map(plan, bounds=sorted(weakest))
     return {name: _picture(figure) for name, figure in draw.items()}

@@ -95,5 +95,5 @@ def test_the_caller_s_jax_flags_do_not_matter(missions):
     with jax.enable_x64(True), jax.default_prng_impl("rbg"), jax.threefry_partitionable(False):
         same(fit(missions, PooledTrust(), draws=25), plain)
         again = sample_prior(shared, 2, 5, seed=1, n_robots=3)
-    for one, other in zip(drawn, again, strict=True):
-        np.testing.assert_array_equal(one, other)
+    for name, values in drawn.values.items():
+        np.testing.assert_array_equal(values, again.values[name])

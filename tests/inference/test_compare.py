@@ -171,13 +171,11 @@ def test_the_table_says_what_is_decided(of_class):
     wrong = PooledTrust(Priors(beta=dist.Normal(-1.0, 0.01)))
     conflict = fit(counted(), wrong, check=False, progress=False)
     fits = {"wrong": conflict, "right": of_class}
-    with pytest.raises(TrustboError, match="custom"):
-        compare(fits)
-    table = compare(fits, models={"wrong": wrong}, progress=False)
+    table = compare(fits, progress=False)
     assert list(table.index) == ["right", "wrong"]
     assert list(table["verdict"]) == ["best", "worse"]
     few = {"wrong": fit(counted(5), wrong, check=False), "right": fit(counted(5), PLAIN)}
-    table = compare(few, models={"wrong": wrong}, progress=False)
+    table = compare(few, progress=False)
     assert "10 missions" in table.loc["wrong", "verdict"]
     az.plot_compare(table)
 

@@ -169,7 +169,7 @@ def test_impossible_values_leave_the_filter_as_it_was(posterior):
         live.update("high", [0.5] * 3)
     with pytest.raises(TrustboError, match=r"awareness: \[1, 0, 0\] = -1 is outside"):
         live.predict([good, good - 1.5])
-    with pytest.raises(TrustboError, match=r"n_ticks\[0\] = 0 must be a whole number"):
+    with pytest.raises(TrustboError, match=r"n_ticks of a bound: \[0\] = 0 must be a whole"):
         live.update(good, [0.5] * 3, n_ticks=0)
     with pytest.raises(TrustboError, match="contact_rate"):
         live.update(good, [0.5] * 3, n_ticks=25)

@@ -164,6 +164,8 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
 
     # Missions of earlier campaigns, which have negative indices, only serve as a reference.
     effect = effect.isel(mission=effect["mission"] >= 0)
+    # Sums have the same rounding errors for any order of the axes in memory.
+    effect = effect.copy(data=np.ascontiguousarray(effect))
 
     less = (effect < -SIZE).mean(_OF_DRAWS)
     more = (effect > SIZE).mean(_OF_DRAWS)

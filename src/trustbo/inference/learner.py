@@ -321,9 +321,10 @@ def add_latent(
         >>> tb.inference.add_latent(posterior)["latent"]["trust_mean"].dims
         ('mission', 'bound', 'robot')
     """
-    posterior = as_fitted("add_latent", posterior)
-    if "latent" in posterior.children:
-        return posterior
+    given = posterior
+    posterior = as_fitted("add_latent", given)
+    if "latent" in given.children:
+        return given
 
     missions = missions_of(posterior) if missions is None else missions
     missions = in_order_of_features(missions, posterior)

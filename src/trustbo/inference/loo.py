@@ -145,7 +145,7 @@ def estimated(
             without, k_hat[i] = refit(posterior, model, int(measured[i]))
             density[i] = mean_likelihood(without, log_p[..., i].values)
 
-    is_bad = ~(k_hat.values <= limit)
+    is_bad = ~(k_hat.values <= np.where(is_refitted, MAX_KHAT, limit))  # a refit has its own limit
     if is_bad.any():
         warn(
             f"Estimated shape parameter of Pareto distribution is greater than {limit:.2f} for "

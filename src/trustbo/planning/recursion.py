@@ -136,7 +136,7 @@ def expected_trust(
         path: Cells of the path, beginning with the start; needed with place effects.
 
     Returns:
-        Expected trust after each bound, shape (draw, bound, robot), or (bound, robot) for one draw.
+        Expected trust after each bound, shape (draw, bound, robot).
 
     Raises:
         TrustboError: If the number of robots or features does not match the parameters; the path
@@ -166,9 +166,7 @@ def expected_trust(
         )
 
     of_robots = np.swapaxes(z, 0, 1)
-    recursion = trust_recursion(params, of_robots, x0, bounds=bounds, by_robot=True)
-    trust = states_along(recursion)
-    return trust if len(trust) > 1 else trust[0]
+    return states_along(trust_recursion(params, of_robots, x0, bounds=bounds, by_robot=True))
 
 
 def states_along(along: Recursion) -> np.ndarray:
