@@ -24,9 +24,9 @@ from trustbo.errors import PosteriorError, TrustboError
 from trustbo.inference import params_of
 from trustbo.inference.functions.data import data_of
 from trustbo.inference.functions.function import as_model, model_of_record
-from trustbo.inference.functions.nuts import Samples
 from trustbo.inference.functions.sampling import _judge as judge
 from trustbo.inference.functions.sampling import targets_of
+from trustbo.inference.nuts import Samples
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.backend import own_settings

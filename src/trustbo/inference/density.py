@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from scipy import special
 
-from trustbo.inference import ep, gradient
+from trustbo.inference import ep
 from trustbo.inference.columns import Columns
 from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, evidence, expected
 from trustbo.inference.importance import Student, climb
@@ -14,7 +14,6 @@ from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
 from trustbo.statespace.blocks import LinearPredictor
-from trustbo.statespace.matrices import namespace
 
 _CHUNK = 32
 """Largest number of points evaluated at once."""
@@ -163,22 +162,19 @@ class Density:
             other.sites = ep.Sites(*(np.where(kept, site, 0.0) for site in self.sites))
         return other
 
-    def theta(self, z: Any) -> dict[str, Any]:
+    def theta(self, z: np.ndarray) -> dict[str, Any]:
         """Convert scores (point, score) to hyperparameters for the model's `linear_predictor`."""
         return self.model.theta(self.scores.values(z), self.observations.resolution)
 
-    def log_density(self, z: Any) -> Any:
+    def log_density(self, z: np.ndarray) -> np.ndarray:
         """Compute the unnormalised log posterior density (point,) of scores (point, score).
 
         Unless rates are Gaussian, the density is that of EP near the theta of `run_ep`, in the
         approximation of `ep.nearby`.
         """
-        if namespace(z) is not np:
-            return self.log_evidence(self.theta(z)) + self.scores.log_prior(z)
-
         log_p = np.full(len(z), -np.inf)
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
-            theta, log_prior, some = self._possible(z)
+            theta, log_prior, some = self.possible(z)
             for where, chunk in chunks(theta, self._n_at_once):
                 fit, _ = self._fit(chunk)
                 log_p[some[where]] = fit.log_p
@@ -191,7 +187,7 @@ class Density:
         found = Coefficients.empty(len(z), self.columns.n)
 
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
-            theta, log_prior, some = self._possible(z)
+            theta, log_prior, some = self.possible(z)
             for where, chunk in chunks(theta, self._n_at_once):
                 fit, prior = self._fit(chunk)
                 log_p[some[where]] = fit.log_p
@@ -202,7 +198,7 @@ class Density:
 
         return np.where(np.isfinite(log_p), log_p, -np.inf), found
 
-    def _possible(self, z: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
+    def possible(self, z: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
         """Return hyperparameters, log priors and indices where the density may be positive."""
         theta = self.theta(z)
         log_prior = self.scores.log_prior(z)
@@ -216,14 +212,8 @@ class Density:
         some = np.flatnonzero(possible)
         return at(theta, some), log_prior[some], some
 
-    def log_evidence(self, theta: Theta) -> Any:
+    def log_evidence(self, theta: Theta) -> np.ndarray:
         """Compute log p(rates | theta) at each point, with EP if rates are not Gaussian."""
-        if namespace(theta["inverse_gain"]) is not np:
-            predictor, prior = self._at(theta)
-            return gradient.log_evidence(
-                self.blocks, predictor, prior, self.site_precision(predictor)
-            )
-
         log_p = np.empty(len(theta["inverse_gain"]))
         for where, chunk in chunks(theta, self._n_at_once):
             if self.exact:
@@ -333,10 +323,10 @@ class Density:
             joint = self._joint(theta)
             return ep.nearby(joint, self.near), joint.prior
 
-        predictor, prior = self._at(theta)
+        predictor, prior = self.given(theta)
         return evidence(self.blocks, predictor, prior, self.site_precision(predictor)), prior
 
-    def _at(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
+    def given(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
         """Return the distribution of the linear predictors and the prior at each theta."""
         self.evaluated(len(theta["inverse_gain"]))
         predictor = self.model.linear_predictor(theta, self.observations, self.layout)
@@ -348,7 +338,7 @@ class Density:
 
     def _joint(self, theta: Theta) -> ep.Joint:
         """Return the blocks, linear predictors, prior and observations for EP at each theta."""
-        return ep.Joint(self.blocks, *self._at(theta), self.rates)
+        return ep.Joint(self.blocks, *self.given(theta), self.rates)
 
 
 def at(theta: Mapping[str, Any], index: Any) -> dict[str, Any]:

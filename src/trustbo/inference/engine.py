@@ -26,7 +26,6 @@ from trustbo.inference.sparse import Factor, Order
 from trustbo.kernels import kernel
 from trustbo.parallel import plain
 from trustbo.statespace.blocks import LinearPredictor, each
-from trustbo.statespace.matrices import namespace
 
 _NEGLIGIBLE = 1e-12
 """Size of a sum of products, relative to the largest one, below which it counts as 0."""
@@ -193,14 +192,11 @@ class Prior(NamedTuple):
             for part in precisions:
                 if id(part) not in known:  # robots often share one array
                     is_diagonal = part.ndim == 2
-                    known[id(part)] = (
-                        namespace(part).log(part).sum(1) if is_diagonal else log_det(part)
-                    )
+                    known[id(part)] = np.log(part).sum(1) if is_diagonal else log_det(part)
                 log_det_of_all = log_det_of_all + known[id(part)]
             parts.extend(precisions)
 
-        xp = namespace(parts[0])
-        return cls(xp.concatenate(means, axis=1), parts, log_det_of_all)
+        return cls(np.concatenate(means, axis=1), parts, log_det_of_all)
 
     @property
     def _columns(self) -> list[np.ndarray]:

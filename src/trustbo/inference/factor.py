@@ -1,12 +1,8 @@
 """Dense Cholesky factors of covariances and precisions."""
 
 from functools import cache
-from typing import Any
 
 import numpy as np
-
-from trustbo.models.backend import inverse_and_log_det
-from trustbo.statespace.matrices import namespace
 
 
 @cache
@@ -15,16 +11,13 @@ def upper(n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.triu_indices(n)
 
 
-def log_diagonal(L: Any) -> Any:
-    """Compute the log determinants of triangular matrices, in NumPy or JAX."""
-    xp = namespace(L)
-    return xp.log(xp.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
+def log_diagonal(L: np.ndarray) -> np.ndarray:
+    """Compute the log determinants of triangular matrices."""
+    return np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
 
 
-def log_det(A: Any) -> Any:
-    """Compute the log determinants of positive definite matrices, in NumPy or JAX."""
-    if not isinstance(A, np.ndarray):
-        return inverse_and_log_det(A)[1]
+def log_det(A: np.ndarray) -> np.ndarray:
+    """Compute the log determinants of positive definite matrices."""
     return 2.0 * log_diagonal(cholesky(A))
 
 

@@ -1,115 +1,268 @@
-"""Sampling with NumPyro's NUTS, on the marginal density or on the full program of a model.
+"""Chains of NumPyro's NUTS: one run of each chain, which can be continued.
 
-For Gaussian rates, coefficients and linear predictors are integrated out, and NUTS samples only the
-scores of the hyperparameters, with gradients of the evidence from JAX (see `gradient`). Their
-posterior is skewed. Below the score at which a standard deviation is too small to matter, the
-density falls as slowly as the prior; above it, the density falls as fast as the likelihood. A step
-size that suits one side leads to divergences on the other. NUTS therefore samples `Whitened`
-coordinates, which are fitted to the points of the importance sampler and are nearly independent and
-standard normal. Warm-up tunes only the step size, and chains start at points of the importance
-sampler. The coordinates change the speed of NUTS, but not the distribution that it samples.
-
-For other families, EP only approximates the evidence, so NUTS samples `model.program`, including
-coefficients and linear predictors.
+`Chains` samples any log density that has a gradient in JAX. `sample_by_nuts` samples the posterior
+of a model class. For Gaussian rates, coefficients and linear predictors are integrated out, and
+NUTS samples only the scores of the hyperparameters, with the density and the slopes of `gradient`.
+Chains start at points of the importance sampler, whose covariance is the mass matrix, so warm-up
+tunes only the step size. For other families, EP only approximates the evidence, so NUTS samples
+`model.program`, including coefficients and linear predictors.
 """
 
-from typing import Any, NamedTuple, Self
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpyro.infer import MCMC, NUTS, init_to_value
-from numpyro.infer.util import ParamInfo
-from scipy import optimize
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from numpyro.infer import init_to_value
+from numpyro.infer.hmc import hmc
+from numpyro.infer.util import initialize_model
 
-from trustbo.display import shows_bars
+from trustbo.arrays import evenly_spaced
+from trustbo.display import announced, slow_bar
+from trustbo.errors import TrustboError
 from trustbo.inference import importance
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.diagnostics import FIELDS, complaints_of, statistics_of
+from trustbo.inference.gradient import log_density_and_slopes
 from trustbo.models.backend import own_settings
-from trustbo.statespace.matrices import namespace
 from trustbo.streams import stream
 
+MOST_DENSE = 50
+"""Largest number of coordinates for which the mass matrix is dense."""
+_CANDIDATES = 16
+"""Number of candidates for the start of a chain; the first one with a density is chosen."""
+_SMALLEST = 1e-12
+"""Standard deviation by which coordinates that are constant are divided."""
+_RIDGE = 1e-3
+"""Fraction of the variances that is added to the covariance of a start."""
+_PART = 50
+"""Number of draws that are compiled as one loop, after which progress is shown."""
 _POINTS = 2000
-"""Number of resampled points to which the coordinates are fitted."""
-_WARMUP_OF_STEP = 150
-"""Number of warm-up draws if only the step size is tuned."""
-_WARMUP_OF_MASS = 300
-"""Number of warm-up draws if the mass matrix is also tuned."""
-_ACCEPT = 0.65
-"""Target of the acceptance probability in whitened coordinates."""
-_ACCEPT_OF_PROGRAM = 0.9
-"""Target of the acceptance probability of the full program."""
-_DEPTH = 2
-"""Largest number of doublings of a trajectory, which then has 3 steps."""
-_FIRST_STEP = 0.8
-"""Initial step size of the warm-up, in sds; three steps cross the posterior."""
-_RIDGE = 1e-6
-"""Number added to the covariance of the points."""
-_SHRINK = 0.01
-"""Penalty on the shape of a marginal, in nats per point."""
-_SLOPE_STEP = 1e-4
-"""Step of the finite differences at the starts of the chains."""
+"""Number of points of the importance sampler from which NUTS of a model class starts."""
 
 
-class Whitened(NamedTuple):
-    """Coordinates in which points are nearly independent and standard normal.
+class Tuning(NamedTuple):
+    """Settings of NUTS."""
 
-    A score is location + scale sinh((arcsinh(y) + skew) / weight), where y = center + root x. The
-    transform of Jones and Pewsey (2009, Biometrika 96) makes skewed marginals with light or heavy
-    tails normal. The coordinates x are uncorrelated.
-    """
+    warmup: int
+    """Number of draws per chain that tune the kernel and are discarded."""
+    accept: float
+    """Target of the acceptance probability."""
+    depth: int = 7
+    """Largest number of doublings of a trajectory, which then has 127 steps."""
+    first_step: float = 0.1
+    """Step size at the beginning of the warm-up."""
+    of_mass: bool = True
+    """Whether the warm-up also tunes the mass matrix."""
 
-    location: np.ndarray  # (score,)
-    scale: np.ndarray  # (score,), like the next three
-    skew: np.ndarray
-    weight: np.ndarray
-    center: np.ndarray
-    root: np.ndarray  # (score, score), lower triangular
+
+_OF_SCORES = Tuning(warmup=150, accept=0.65, depth=2, first_step=0.8, of_mass=False)
+"""Settings for scores; three steps of 0.8 standard deviations cross the posterior."""
+_OF_PROGRAM = Tuning(warmup=300, accept=0.9, depth=10)
+"""Settings for the full program of a model."""
+
+
+class Start(NamedTuple):
+    """Starts of the chains."""
+
+    x: np.ndarray
+    """Candidates, shape (chain, candidate, coordinate)."""
+    inverse_mass: np.ndarray
+    """Inverse mass matrix (coordinate, coordinate), or its diagonal (coordinate,)."""
 
     @classmethod
-    def from_scores(cls, z: np.ndarray) -> Self:
-        """Fit the coordinates to scores z (point, score) by maximum likelihood."""
-        shapes = [_marginal(one) for one in z.T]
-        location, log_scale, skew, log_weight = np.transpose(shapes)
-        marginals = location, np.exp(log_scale), skew, np.exp(log_weight)
+    def near(cls, x: np.ndarray, chains: int, seed: int) -> "Start":
+        """Return a start from draws x (draw, coordinate) of a similar distribution."""
+        rng = np.random.default_rng([seed, 1])
 
-        d = z.shape[1]
-        y = cls(*marginals, np.zeros(d), np.eye(d)).whiten(z)
-        covariance = np.cov(y.T).reshape(d, d) + _RIDGE * np.eye(d)
-        return cls(*marginals, y.mean(0), np.linalg.cholesky(covariance))
+        # Each chain starts in its own part along the main axis, so that modes get chains.
+        main = np.linalg.svd((x - x.mean(0)) / np.maximum(x.std(0), _SMALLEST), full_matrices=False)
+        parts = np.array_split(np.argsort(main.U[:, 0], kind="stable"), chains)
+        chosen = np.stack([x[rng.choice(part, _CANDIDATES)] for part in parts])
 
-    def whiten(self, z: np.ndarray) -> np.ndarray:
-        """Convert scores z (point, score) to coordinates x (point, score)."""
-        u = (z - self.location) / self.scale
-        t = self.weight * np.arcsinh(u) - self.skew
-        return np.linalg.solve(self.root, (np.sinh(t) - self.center).T).T
+        variance = x.var(0)
+        mass = variance
+        if x.shape[1] <= MOST_DENSE:
+            mass = np.cov(x.T).reshape(x.shape[1], -1) + _RIDGE * np.diag(variance)
+        return cls(chosen, mass)
 
-    def scores(self, x: Any) -> tuple[Any, Any]:
-        """Convert coordinates x (point, score) to scores, in NumPy or JAX.
 
-        Also returns the log determinants (point,) of the Jacobian, up to a constant.
+class Samples(NamedTuple):
+    """Draws of chains, and statistics of the sampler."""
+
+    x: np.ndarray
+    """Coordinates, shape (chain, draw, coordinate)."""
+    fields: dict[str, np.ndarray]
+    """Statistics (chain, draw) by NumPyro's names."""
+
+    @classmethod
+    def joined(cls, runs: Sequence["Samples"]) -> "Samples":
+        """Join draws that follow each other, chain by chain."""
+        fields = {name: np.concatenate([one.fields[name] for one in runs], 1) for name in FIELDS}
+        return cls(np.concatenate([one.x for one in runs], axis=1), fields)
+
+    def some(self, draws: int) -> "Samples":
+        """Return `draws` evenly spaced draws of each chain."""
+        kept = evenly_spaced(self.x.shape[1], draws)
+        fields = {name: values[:, kept] for name, values in self.fields.items()}
+        return Samples(self.x[:, kept], fields)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Coordinates of all chains, shape (draw, coordinate)."""
+        return self.x.reshape(-1, self.x.shape[2])
+
+
+LogDensity = Callable[[Any, Any], Any]
+"""Log density, up to a constant, of coordinates (coordinate,) and data in JAX."""
+Compiled = Callable[[tuple[Any, ...], Callable[..., Any], int], Callable[..., Any]]
+"""Compiles a function, given what tells it from others, for arguments of which the first ones have
+the axis (chain,), and the last one is the data; the compiled function takes the first ones."""
+
+
+def compiled_without_data(
+    key: tuple[Any, ...], compute: Callable[..., Any], n_chain_axes: int
+) -> Callable[..., Any]:
+    """Compile a function whose data are None; see `Compiled`."""
+    mapped = jax.jit(jax.vmap(lambda *of_chain: compute(*of_chain, None)))
+
+    def call(*of_chains: Any) -> Any:
+        with own_settings():
+            return jax.tree.map(np.asarray, mapped(*of_chains))
+
+    return call
+
+
+class Chains:
+    """Chains of NUTS for a log density.
+
+    The starts of the chains, the step size and the mass matrix are arguments of the compiled
+    functions. A campaign, which fits after each mission, therefore compiles those of a NumPyro
+    function again only when the padded data grow.
+
+    Args:
+        log_density: The log density.
+        compiled: Compiles functions of chains.
+        tuning: Settings.
+        who: The model, for messages.
+        seed: Random seed.
+        progress: Whether to show a progress bar, after 1.5 seconds.
+    """
+
+    def __init__(
+        self,
+        log_density: LogDensity,
+        compiled: Compiled,
+        tuning: Tuning,
+        *,
+        who: str,
+        seed: int,
+        progress: bool,
+    ) -> None:
+        self.log_density = log_density
+        self.tuning = tuning
+        self.who = who
+        self.seed = seed
+        self.progress = progress
+        self._compile = compiled
+        self._compiled: dict[str, Callable[..., Any]] = {}
+        self._state: Any = None
+
+    def run(self, start: Start, draws: int) -> Samples:
+        """Start the chains; return the draws after the warm-up.
+
+        Raises:
+            TrustboError: If no candidate has a finite density, or a gradient is not finite.
         """
-        xp = namespace(x)
-        y = self.center + x @ self.root.T
-        t = (xp.arcsinh(y) + self.skew) / self.weight
-        log_jacobian = (xp.log(xp.cosh(t)) - 0.5 * xp.log1p(y**2)).sum(-1)
-        return self.location + self.scale * xp.sinh(t), log_jacobian
+        n_chains = len(start.x)
+        mass = np.broadcast_to(start.inverse_mass, (n_chains, *start.inverse_mass.shape))
+        with own_settings(), announced("Compiling the model for NUTS (about 20 s at first use)."):
+            keys = jax.random.key_data(jax.random.split(jax.random.key(self.seed), n_chains))
+            begin = self._of_chains("begin", self._begin, 3)
+            self._state, has_density, has_slope = begin(np.asarray(keys), start.x, mass)
 
+        if not np.all(has_density):
+            raise TrustboError(
+                f"{self.who} has no finite density at the starts of the chains. Check "
+                "that delta_w and delta_v are positive and that the drift is finite, also where an "
+                "input such as duration or n_ticks is NaN (jnp.nan_to_num)."
+            )
+        if not np.all(has_slope):
+            raise TrustboError(
+                f"{self.who} has a gradient that is not finite at the starts of the "
+                "chains; check square roots, norms and powers of 0 and inverses of singular "
+                "matrices, also in branches of jnp.where that are not used."
+            )
+        self._advance(self.tuning.warmup, "NUTS, warm-up")
+        return self.proceed(draws)
 
-def _marginal(z: np.ndarray) -> np.ndarray:
-    """Fit location, log scale, skew and log weight of `Whitened` to values z (point,)."""
+    def proceed(self, draws: int) -> Samples:
+        """Continue the chains; return the next draws."""
+        return self._advance(draws, "NUTS")
 
-    def cost(shape: np.ndarray) -> float:
-        location, log_scale, skew, log_weight = shape
-        u = (z - location) / np.exp(log_scale)
-        t = np.exp(log_weight) * np.arcsinh(u) - skew
-        log_slope = log_weight - log_scale + np.log(np.cosh(t)) - 0.5 * np.log1p(u**2)
-        return np.mean(0.5 * np.sinh(t) ** 2 - log_slope) + _SHRINK * (skew**2 + log_weight**2)
+    def _advance(self, draws: int, title: str) -> Samples:
+        """Take draws in parts."""
+        parts = []
+        sizes = [_PART] * (draws // _PART) + [draws % _PART] * (draws % _PART > 0)
+        with slow_bar(title, " draws", self.progress, total=draws) as bar:
+            for n in sizes:
+                advance = self._of_chains(f"advance by {n}", partial(self._advanced, n=n), 1)
+                self._state, x, fields = advance(self._state)
+                parts.append(Samples(x, fields))
+                bar.update(n)
+        return Samples.joined(parts)
 
-    start = [z.mean(), np.log(z.std() + _RIDGE), 0.0, 0.0]
-    with np.errstate(all="ignore"):  # the search may try extreme shapes
-        return optimize.minimize(cost, start, method="BFGS").x
+    def _of_chains(
+        self, name: str, compute: Callable[..., Any], n_chain_axes: int
+    ) -> Callable[..., Any]:
+        """Return a function of states of chains, compiled for these data."""
+        if name not in self._compiled:
+            key = name, self.tuning
+            self._compiled[name] = self._compile(key, compute, n_chain_axes)
+        return self._compiled[name]
+
+    def _kernel(self, x: Any, mass: Any, key: Any, data: Any) -> tuple[Any, Callable[..., Any]]:
+        """Return the state of a chain at x, and the function that moves a state."""
+        begin, move = hmc(potential_fn=lambda x: -self.log_density(x, data), algo="NUTS")
+        state = begin(
+            x,
+            num_warmup=self.tuning.warmup,
+            step_size=self.tuning.first_step,
+            inverse_mass_matrix=mass,
+            dense_mass=mass.ndim == 2,
+            adapt_mass_matrix=self.tuning.of_mass,
+            target_accept_prob=self.tuning.accept,
+            max_tree_depth=self.tuning.depth,
+            rng_key=key,
+        )
+        return state, move
+
+    def _begin(self, key: Any, candidates: Any, mass: Any, data: Any) -> tuple[Any, Any, Any]:
+        """Start a chain at the first candidate that has a density.
+
+        With the largest density instead, all chains would start at the same mode.
+        """
+        density = lax.map(lambda x: self.log_density(x, data), candidates)
+        chosen = jnp.argmax(jnp.isfinite(density))
+        state, _ = self._kernel(candidates[chosen], mass, key, data)
+        return state, jnp.isfinite(density[chosen]), jnp.isfinite(state.z_grad).all()
+
+    def _advanced(self, state: Any, data: Any, *, n: int) -> tuple[Any, Any, Any]:
+        """Take n draws of a chain; return its state, coordinates and statistics."""
+        # NumPyro's kernel is made with its first state, which is not computed if it is not used.
+        mass = state.adapt_state.inverse_mass_matrix
+        _, move = self._kernel(state.z, mass, state.rng_key, data)
+
+        def one(state: Any, _: None) -> Any:
+            state = move(state, (), {})
+            return state, (state.z, {name: getattr(state, name) for name in FIELDS})
+
+        last, (x, fields) = lax.scan(one, state, None, length=n)
+        return last, x, fields
 
 
 def sample_by_nuts(
@@ -121,7 +274,7 @@ def sample_by_nuts(
     seed: int,
     progress: bool = True,
 ) -> tuple[JointDraws, dict[str, np.ndarray], dict[str, Any], list[str]]:
-    """Sample a posterior with NumPyro's NUTS in vectorised chains.
+    """Sample the posterior of a model class.
 
     Args:
         density: Density of a model given missions.
@@ -136,89 +289,95 @@ def sample_by_nuts(
         Draws with chains joined, statistics (draw,) by name, diagnostics and a list of failed
         checks.
     """
-    if warmup is None:
-        warmup = _WARMUP_OF_STEP if density.exact else _WARMUP_OF_MASS
-
     rng = stream(seed, "nuts")
     points = importance.sample(
         density.log_density, density.start()[None], rng, defensive=density.defensive
     )
     z = points.z[points.resample(_POINTS, rng)]
-    coordinates = Whitened.from_scores(z)
 
-    with own_settings():
-        if density.exact:
-            kernel = _marginal_kernel(density, coordinates)
-            starts = _starts(density, coordinates, rng.choice(z, chains, replace=False))
-            if chains == 1:  # NumPyro expects no axis for chains
-                starts = jax.tree.map(lambda values: values[0], starts)
-        else:
-            kernel = _full_kernel(density, z)
-            starts = None
-
-        mcmc = MCMC(
-            kernel, num_warmup=warmup, num_samples=draws, num_chains=chains,
-            chain_method="vectorized", progress_bar=progress and shows_bars(),
-        )  # fmt: skip
-        mcmc.run(jax.random.key(seed), init_params=starts, extra_fields=FIELDS)
-
-        fields = {name: np.asarray(v) for name, v in mcmc.get_extra_fields().items()}
-        samples: Any = jax.tree.map(np.asarray, mcmc.get_samples())
-
-    stats = statistics_of(fields)
-    resolution = density.observations.resolution
+    tuning = _OF_SCORES if density.exact else _OF_PROGRAM
+    if warmup is not None:
+        tuning = tuning._replace(warmup=warmup)
     if density.exact:
-        z, log_jacobian = coordinates.scores(samples)
-        stats["lp"] = stats["lp"] - log_jacobian
-        values = density.scores.values(z)
-        theta = density.model.theta(values, resolution)
-        drawn = JointDraws(theta, density.draw_coefficients(theta, rng))
+        log_density = _in_jax(density)
+        start = Start.near(z, chains, seed)
+        constrain = density.scores.values
     else:
-        values = {name: samples[name] for name in density.scores.priors}
-        theta = density.model.theta(values, resolution)
-        drawn = JointDraws(theta, samples["coefficients"])
+        log_density, start, constrain = _program(density, z, chains, seed)
+
+    sampler = Chains(
+        log_density, compiled_without_data, tuning,
+        who=type(density.model).__name__, seed=seed, progress=progress,
+    )  # fmt: skip
+    samples = sampler.run(start, draws)
+
+    found = constrain(samples.points)
+    values = {name: found[name] for name in density.scores.priors}
+    theta = density.model.theta(values, density.observations.resolution)
+    c = density.draw_coefficients(theta, rng) if density.exact else found["coefficients"]
 
     by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
-    found, complaints = complaints_of(by_chain, stats["diverging"])
-    return drawn, stats, found, complaints
+    summary, complaints = complaints_of(by_chain, samples.fields["diverging"])
+    statistics = statistics_of({n: v.reshape(-1) for n, v in samples.fields.items()})
+    return JointDraws(theta, c), statistics, summary, complaints
 
 
-def _marginal_kernel(density: Density, coordinates: Whitened) -> NUTS:
-    """Make the kernel for scores in whitened coordinates."""
+def _in_jax(density: Density) -> LogDensity:
+    """Return the log density of scores (score,) and no data in JAX, with its gradient.
 
-    def potential(x: jax.Array) -> jax.Array:
-        z, log_jacobian = coordinates.scores(x[None])
-        return -(density.log_density(z) + log_jacobian)[0]
-
-    return NUTS(
-        potential_fn=potential, adapt_mass_matrix=False, target_accept_prob=_ACCEPT,
-        step_size=_FIRST_STEP, max_tree_depth=_DEPTH,
-    )  # fmt: skip
-
-
-def _starts(density: Density, coordinates: Whitened, z: np.ndarray) -> ParamInfo:
-    """Return the states at which chains start, with scores z (chain, score).
-
-    NumPy computes the first potentials and slopes, so JAX compiles the gradient only once.
+    Numbers are passed as pairs of integers: callbacks run in threads of JAX without the setting of
+    `own_settings`, in which JAX would round them to single precision.
     """
-    x = coordinates.whiten(z)
-    n, d = x.shape
-    steps = _SLOPE_STEP * np.vstack([np.zeros((1, d)), np.eye(d), -np.eye(d)])
 
-    at, log_jacobian = coordinates.scores((x[:, None] + steps).reshape(-1, d))
-    potential = -(density.log_density(at) + log_jacobian).reshape(n, -1)
-    slope = (potential[:, 1 : d + 1] - potential[:, d + 1 :]) / (2.0 * _SLOPE_STEP)
-    return ParamInfo(*map(jnp.asarray, (x, potential[:, 0], slope)))
+    def on_bits(bits: Any) -> np.ndarray:
+        z = np.asarray(bits).view(np.float64)[..., 0]  # (..., score); `jax.vmap` adds axes
+        log_p, slopes = log_density_and_slopes(density, z.reshape(-1, z.shape[-1]))
+        found = np.concatenate([log_p[:, None], slopes], axis=1)
+        return found.reshape(*z.shape[:-1], -1, 1).view(np.uint32)
+
+    def found(z: Any) -> tuple[Any, Any]:
+        bits = jax.pure_callback(
+            on_bits,
+            jax.ShapeDtypeStruct((len(z) + 1, 2), np.uint32),
+            lax.bitcast_convert_type(z, np.uint32),
+            vmap_method="broadcast_all",
+        )
+        values = lax.bitcast_convert_type(bits, np.float64)
+        return values[0], values[1:]
+
+    log_density = jax.custom_vjp(lambda z: found(z)[0])
+    log_density.defvjp(found, lambda slopes, slope: (slope * slopes,))
+    return lambda z, _: log_density(z)
 
 
-def _full_kernel(density: Density, z: np.ndarray) -> NUTS:
-    """Make the kernel for the model's program; chains start at the median of the scores z."""
-    values = density.scores.values(z)
-    center = {name: jnp.asarray(np.median(v, axis=0)) for name, v in values.items()}
+def _program(
+    density: Density, z: np.ndarray, chains: int, seed: int
+) -> tuple[LogDensity, Start, Callable[[np.ndarray], dict[str, np.ndarray]]]:
+    """Prepare the model's program for `Chains`.
+
+    Returns:
+        The log density in unconstrained coordinates, a start at the median of scores z (point,
+        score), and the conversion of coordinates (draw, coordinate) to values (draw, ...) of sites.
+    """
 
     def program() -> None:
         density.model.program(density.observations)
 
-    return NUTS(
-        program, init_strategy=init_to_value(values=center), target_accept_prob=_ACCEPT_OF_PROGRAM
-    )
+    with own_settings():
+        values = density.scores.values(z)
+        center = {name: jnp.asarray(np.median(v, axis=0)) for name, v in values.items()}
+        keys = jax.random.split(jax.random.key(seed), chains)
+        found = initialize_model(keys, program, init_strategy=init_to_value(values=center))
+        of_chains: Any = found.param_info.z
+        x = np.asarray(jax.vmap(lambda free: ravel_pytree(free)[0])(of_chains))
+        unravel = ravel_pytree(jax.tree.map(lambda v: v[0], of_chains))[1]
+
+    def constrain(x: np.ndarray) -> dict[str, np.ndarray]:
+        with own_settings():
+            of_sites = jax.vmap(lambda one: found.postprocess_fn(unravel(one)))(x)
+            return jax.tree.map(np.asarray, of_sites)
+
+    def log_density(x: Any, data: None) -> Any:
+        return -found.potential_fn(unravel(x))
+
+    return log_density, Start(x[:, None], np.ones(x.shape[1])), constrain

@@ -19,12 +19,9 @@ from threading import Lock
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import jaxlib.version
-import numpy as np
 from jax.experimental.compilation_cache import compilation_cache
 from scipy import special
-from scipy.linalg import lapack
 
 from trustbo.compiled import folder_of
 from trustbo.forks import require_threads_of_jax
@@ -72,58 +69,6 @@ def library_attrs(sampler: str) -> dict[str, str]:
 def special_functions(x: Any) -> Any:
     """Return `jax.scipy.special` for a JAX array, otherwise `scipy.special`."""
     return jax.scipy.special if isinstance(x, jax.Array) else special
-
-
-def inverse(A: Any) -> Any:
-    """Invert positive definite matrices (point, n, n); in NumPy, other matrices give NaN."""
-    if isinstance(A, jax.Array):
-        return inverse_and_log_det(A)[0]
-
-    H = A.copy()
-    for one in H:  # `one.T` equals the symmetric `one`, and has LAPACK's memory order
-        _, failed = lapack.dpotrf(one.T, lower=1, overwrite_a=1)  # pyright: ignore[reportAttributeAccessIssue]
-        if failed:
-            one[:] = np.nan
-    return inverse_from_factor(H)
-
-
-def inverse_from_factor(H: np.ndarray) -> np.ndarray:
-    """Compute (H' H)^-1 for upper triangular matrices H (point, n, n), which are overwritten."""
-    for one in H:
-        lapack.dpotri(one.T, lower=1, overwrite_c=1)  # pyright: ignore[reportAttributeAccessIssue]
-    return H + np.swapaxes(np.triu(H, 1), 1, 2)
-
-
-@jax.custom_vjp
-def inverse_and_log_det(A: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Invert positive definite matrices (..., n, n) in JAX; also return their log determinants.
-
-    The derivatives are products of the inverse. They compile in a third of the time that JAX takes
-    to compile the derivatives of its factorisations.
-    """
-    L = jax.lax.linalg.cholesky(A, symmetrize_input=False)
-    one = jnp.broadcast_to(jnp.eye(A.shape[-1]), A.shape)
-    half = jax.lax.linalg.triangular_solve(L, one, left_side=True, lower=True)
-
-    log_det = 2.0 * jnp.log(jnp.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
-    return half.mT @ half, log_det
-
-
-def _with_inverse(A: jax.Array) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
-    """Return the values of `inverse_and_log_det`, and what their derivatives need."""
-    found = inverse_and_log_det(A)
-    return found, found[0]
-
-
-def _slopes(inverse: jax.Array, slopes: tuple[jax.Array, jax.Array]) -> tuple[jax.Array]:
-    """Return the derivatives with respect to A, given those with respect to both values."""
-    of_inverse, of_log_det = slopes
-
-    # d log det A = tr(A^-1 dA) and d A^-1 = -A^-1 dA A^-1 (Petersen, Pedersen 2012, 2.1-2.2).
-    return (of_log_det[..., None, None] * inverse - inverse @ of_inverse @ inverse,)
-
-
-inverse_and_log_det.defvjp(_with_inverse, _slopes)
 
 
 @partial(jax.jit, static_argnums=1)

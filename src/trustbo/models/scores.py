@@ -15,22 +15,17 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 from scipy import special, stats
-from scipy.interpolate import CubicSpline
 
 from trustbo.errors import TrustboError
-from trustbo.models.backend import call, own_settings, special_functions
-from trustbo.statespace.matrices import namespace
+from trustbo.models.backend import call, own_settings
 
 NOISES = "delta_w", "delta_v"
 _LOG_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
-_FARTHEST = 9.0  # largest score at which quantiles are interpolated in JAX
-_N_KNOTS = 2001
 _SMALLEST_P = 1e-300  # probabilities at which NumPyro computes quantiles are in this range
 _LARGEST_P = 1.0 - 1e-16
 
@@ -88,19 +83,7 @@ class NormalScores:
         """Return the indices of the scores of some hyperparameters."""
         return np.concatenate([np.arange(self.n_scores)[self.at[name]] for name in names])
 
-    @cached_property
-    def cubics(self) -> np.ndarray:
-        """Coefficients (power, interval, score) of splines through the quantiles of the priors."""
-        knots = np.linspace(-_FARTHEST, _FARTHEST, _N_KNOTS)
-        columns = []
-        for name, prior in self.priors.items():
-            n = self.at[name].stop - self.at[name].start
-            at = np.broadcast_to(knots[:, None], (_N_KNOTS, n))
-            columns.append(quantile(prior, at, name))
-
-        return CubicSpline(knots, np.concatenate(columns, axis=1)).c
-
-    def values(self, z: Any) -> dict[str, Any]:
+    def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
         """Convert scores (point, score) to hyperparameters (point,) or (point, k) by name."""
         half_normal = {}
         for pair in self.pairs:
@@ -116,32 +99,26 @@ class NormalScores:
 
         return found
 
-    def _value(self, name: str, z: Any) -> Any:
+    def _value(self, name: str, z: np.ndarray) -> np.ndarray:
         """Return values (point, k) of a hyperparameter that is in no pair."""
-        at = self.at[name]
-        if namespace(z) is np:
-            return quantile(self.priors[name], z[:, at], name)
-        return _interpolated(self.cubics[:, :, at], z[:, at])
+        return quantile(self.priors[name], z[:, self.at[name]], name)
 
-    def _factor(self, pair: Pair, z: Any) -> Any:
+    def _factor(self, pair: Pair, z: np.ndarray) -> np.ndarray | float:
         """Return the factor (point, 1) of the first standard deviation of a pair."""
         return pair.factor(self._value(pair.given, z)) if pair.given else 1.0
 
-    def _half_normal(self, pair: Pair, z: Any) -> dict[str, Any]:
+    def _half_normal(self, pair: Pair, z: np.ndarray) -> dict[str, np.ndarray]:
         """Return the half-normal scores (point, k) of a pair by name."""
-        xp = namespace(z)
-        ndtr = special_functions(z).ndtr
-        size = xp.exp(z[:, self.at[pair.first]])
+        size = np.exp(z[:, self.at[pair.first]])
         angle = z[:, self.at[pair.second]]
 
         # The cosine of an angle is the sine of its complement, which is accurate near 0.
-        first = size * xp.sin(0.5 * np.pi * ndtr(angle))
-        second = size * xp.sin(0.5 * np.pi * ndtr(-angle))
+        first = size * np.sin(0.5 * np.pi * special.ndtr(angle))
+        second = size * np.sin(0.5 * np.pi * special.ndtr(-angle))
         return {pair.first: first / self._factor(pair, z), pair.second: second}
 
-    def log_prior(self, z: Any) -> Any:
+    def log_prior(self, z: np.ndarray) -> np.ndarray:
         """Compute the log prior density (point,) of scores (point, score)."""
-        xp = namespace(z)
         log_size = z[:, self.sizes]
 
         # Scores other than log sizes are standard normal.
@@ -155,7 +132,7 @@ class NormalScores:
             squares = sum((a**2).sum(1) for a in self._half_normal(pair, z).values())
             total = total - 0.5 * squares
             if pair.given:
-                total = total - xp.log(self._factor(pair, z))[:, 0]
+                total = total - np.log(self._factor(pair, z))[:, 0]
 
         return total
 
@@ -201,28 +178,11 @@ def quantile(prior: Distribution, score: np.ndarray, name: str) -> np.ndarray:
     return _by_numpyro(prior, special.ndtr(score), name)
 
 
-def _interpolated(cubics: np.ndarray, score: jax.Array) -> jax.Array:
-    """Interpolate quantiles in JAX, which lacks the quantiles of some distributions.
-
-    Args:
-        cubics: Coefficients of polynomials (power, interval, score); see `NormalScores.cubics`.
-        score: Normal scores (point, score).
-    """
-    step = 2.0 * _FARTHEST / (_N_KNOTS - 1)
-    interval = jnp.clip(jnp.floor((score + _FARTHEST) / step), 0, _N_KNOTS - 2).astype(int)
-    x = score + _FARTHEST - step * interval
-
-    a, b, c, d = jnp.asarray(cubics)[:, interval, np.arange(score.shape[1])]
-    return ((a * x + b) * x + c) * x + d
-
-
-def of_half_normal(prior: Distribution, score: Any, name: str) -> Any:
+def of_half_normal(prior: Distribution, score: np.ndarray, name: str) -> np.ndarray:
     """Compute the quantile of a prior at the probability P(|N(0, 1)| < score)."""
     prior = _base(prior)
     if isinstance(prior, dist.HalfNormal):
         return np.asarray(prior.scale) * score
-    if namespace(score) is not np:
-        return prior.icdf(jax.scipy.special.erf(score / np.sqrt(2.0)))
     return _by_numpyro(prior, special.erf(score / np.sqrt(2.0)), name)
 
 

@@ -30,8 +30,13 @@ from trustbo.inference.functions.draws import (
     no_weights,
 )
 from trustbo.inference.functions.function import FunctionModel
-from trustbo.inference.functions.nuts import require_gradient
-from trustbo.inference.functions.sampling import NUTS, keys_of, sampled, targets_of
+from trustbo.inference.functions.sampling import (
+    NUTS,
+    keys_of,
+    require_gradient,
+    sampled,
+    targets_of,
+)
 from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.functions.source import OF_PRIOR, FunctionData, OfFunction
 from trustbo.inference.latent import N_PRIOR
@@ -259,7 +264,7 @@ def require_learnable(model: FunctionModel, workspace: Workspace, *, by_gradient
     if by_gradient:
         if model.effects(data):
             _require_integrable(model, NUTS)
-        require_gradient(model, targets_of(model, data, sites)[0].coordinates, data)
+        require_gradient(targets_of(model, data, sites)[0])
     if not model.needs_observations:  # its data are not padded
         require_unpadded_results(model, data, sites, [len(known)])
 

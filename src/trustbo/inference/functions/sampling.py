@@ -10,23 +10,17 @@ import xarray as xr
 from trustbo.arrays import evenly_spaced
 from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
-from trustbo.errors import warn
+from trustbo.errors import TrustboError, warn
 from trustbo.inference import mixtures
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, statistics_of
 from trustbo.inference.draws import joined_draws
 from trustbo.inference.functions.coordinates import Coordinates
 from trustbo.inference.functions.data import RATES, Data
 from trustbo.inference.functions.effects import AddedEffects
+from trustbo.inference.functions.explain import reason_of
 from trustbo.inference.functions.function import FunctionModel, Outer
-from trustbo.inference.functions.nuts import (
-    Chains,
-    Samples,
-    Start,
-    joined_samples,
-    log_density_of,
-    require_gradient,
-)
 from trustbo.inference.functions.sites import Site, safe
+from trustbo.inference.nuts import Chains, Samples, Start, Tuning
 from trustbo.inference.options import Options
 from trustbo.models.backend import own_settings
 from trustbo.statespace import StateSpace
@@ -104,10 +98,13 @@ class Target:
             log_p, space, drift, theta = self._given(x)
             return log_p + self.effects.log_evidence(space, drift, theta)
 
-        def one(x: Any, data: Data) -> Any:
-            return log_density_of(self.model, self.coordinates, x, data)
+        return self._in_batches("log density", self.traced, x)
 
-        return self._in_batches("log density", one, x)
+    def traced(self, x: Any, data: Data) -> Any:
+        """Compute the log density, up to a constant, at coordinates (coordinate,) in JAX."""
+        z = self.coordinates.unconstrained(x)
+        log_jacobian = self.coordinates.log_jacobian(x)
+        return log_jacobian - self.model.potential(z, data, self.coordinates.deviations)
 
     def draw_effects(
         self, x: np.ndarray, rng: np.random.Generator
@@ -159,9 +156,7 @@ class Target:
 
         It is compiled for one number of draws.
         """
-        key = (name, self.coordinates.key)
-        compiled = self.model.compiled_over_draws(key, compute, 1, self.data)
-
+        compiled = self.compiled((name,), compute, 1)
         n = len(jax.tree.leaves(draws)[0])
         n_missing = -n % mixtures.BATCH
         whole = jax.tree.map(lambda a: np.concatenate([a, a[:1].repeat(n_missing, 0)]), draws)
@@ -170,6 +165,13 @@ class Target:
             for k in range(0, n, mixtures.BATCH)
         ]
         return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:n], *parts)
+
+    def compiled(
+        self, key: tuple[Any, ...], compute: Callable[..., Any], n_draw_axes: int
+    ) -> Callable[..., Any]:
+        """Return a function of draws, compiled for these data; see `compiled_over_draws`."""
+        key = *key, self.coordinates.key
+        return self.model.compiled_over_draws(key, compute, n_draw_axes, self.data)
 
     def finite_points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return `points`, without draws that have infinite coordinates."""
@@ -228,7 +230,7 @@ def sampled(
         if sampler == IMPORTANCE or has_effects or (sampler == AUTO and not found.complaints):
             return _resampled(target, found, options.chains * draws, seed)
 
-    require_gradient(target.model, target.coordinates, target.data)
+    require_gradient(target)
     if found is None:
         x = target.finite_points(known or prior)
     else:
@@ -338,14 +340,15 @@ def _by_nuts(
     The requested number of draws is kept, evenly spaced, or all draws if the checks need more. If
     many transitions diverge, the chains start again from their draws, once, with smaller steps.
     """
-    options: dict[str, Any] = {"warmup": warmup, "seed": seed, "progress": progress}
-    chains = Chains(target.model, target.coordinates, target.data, accept=_ACCEPT, **options)
+    tuning = Tuning(warmup, _ACCEPT)
+    options: dict[str, Any] = {"seed": seed, "progress": progress}
+    options["who"] = target.model.in_short()
+    chains = Chains(target.traced, target.compiled, tuning, **options)
     samples = chains.run(start, draws)
     if check and samples.fields["diverging"].mean() > _TOLERATED:
         start = Start.near(samples.points, len(start.x), seed + 1)
-        chains = Chains(
-            target.model, target.coordinates, target.data, accept=_LAST_ACCEPT, **options
-        )
+        tuning = Tuning(warmup, _LAST_ACCEPT)
+        chains = Chains(target.traced, target.compiled, tuning, **options)
         samples = chains.run(start, draws)
 
     patient = False
@@ -356,7 +359,7 @@ def _by_nuts(
         verdict = _judge(target, samples, patient=True, last=is_last)
         if not verdict.complaints or is_last:
             break
-        samples = joined_samples([samples, chains.proceed(samples.x.shape[1])])
+        samples = Samples.joined([samples, chains.proceed(samples.x.shape[1])])
 
     few = samples.some(draws)
     of_few = verdict if few.x.shape == samples.x.shape else _judge(target, few, patient=patient)
@@ -458,6 +461,29 @@ def _warn(model: FunctionModel, verdict: Verdict, n_transitions: int) -> None:
                 f"{chains}, but those of the drift and noises agree: plans and predictions can be "
                 "used, these variables cannot."
             )
+
+
+def require_gradient(target: Target) -> None:
+    """Raise TrustboError if JAX cannot differentiate the density of a function.
+
+    The gradient is traced without computing anything.
+    """
+
+    def slope(x: Any) -> Any:
+        return jax.grad(lambda x: target.traced(x, target.data))(x)
+
+    try:
+        with own_settings():
+            jax.eval_shape(slope, np.zeros(target.coordinates.n))
+    except TrustboError:
+        raise
+    except Exception as error:
+        reason = reason_of(error).rstrip(".")
+        raise TrustboError(
+            f"{target.model.in_short()} has no gradient, which NUTS needs: {reason}. Use "
+            "jax.lax.scan for loops, or jax.lax.fori_loop with constant bounds, and define the "
+            "gradient of callbacks with jax.custom_jvp or jax.custom_vjp."
+        ) from error
 
 
 def keys_of(n: int, seed: int) -> Any:

@@ -8,11 +8,10 @@ import numpy as np
 import numpyro.distributions as dist
 from numpy.typing import ArrayLike
 from scipy import sparse
-from scipy.linalg import helmert
+from scipy.linalg import helmert, lapack
 
 from trustbo.data import Mission
 from trustbo.errors import require_positive
-from trustbo.models.backend import inverse
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
@@ -143,7 +142,7 @@ class PlaceEffect(Effect):
         K = matern(distance, scale[:, None])[:, square]
 
         tau = xp.maximum(theta["tau_s"], LEAST)[:, None, None]
-        return inverse(tau**2 * (K + _JITTER * np.eye(len(square))))
+        return _inverse(tau**2 * (K + _JITTER * np.eye(len(square))))
 
     def to_variables(self, c: np.ndarray, theta: Theta, observations: Observations) -> Values:
         """Return `place` (draw, cell), `place_bound` (draw, bound), `place_robot` (.., robot)."""
@@ -159,6 +158,21 @@ class PlaceEffect(Effect):
         of_robots = values["place_robot"] @ contrasts(observations.n_robots)
         of_robots = of_robots.reshape(len(of_robots), -1)
         return np.column_stack([values["place"], values["place_bound"], of_robots])
+
+
+def _inverse(A: Any) -> Any:
+    """Invert positive definite matrices (point, n, n); in NumPy, other matrices give NaN."""
+    xp = namespace(A)
+    if xp is not np:
+        return xp.linalg.inv(A)
+
+    H = A.copy()
+    for one in H:  # `one.T` equals the symmetric `one`, and has LAPACK's memory order
+        _, failed = lapack.dpotrf(one.T, lower=1, overwrite_a=1)  # pyright: ignore[reportAttributeAccessIssue]
+        if failed:
+            one[:] = np.nan
+        lapack.dpotri(one.T, lower=1, overwrite_c=1)  # pyright: ignore[reportAttributeAccessIssue]
+    return H + np.swapaxes(np.triu(H, 1), 1, 2)
 
 
 def _sd_given_neighbour(length_scale: Any) -> Any:
