@@ -442,7 +442,9 @@ class Campaign(Recorder):
     ) -> Iterator[tuple[Plan, Mission]]:
         """Run missions for `run`, which has checked the arguments."""
         self.state = replace(self.state, stop_reason="interrupted")
-        reason = yield from run_missions(self, simulator, n_iterations, stop, self._progress)
+        reason = yield from run_missions(
+            self, self.ask, self.tell, simulator, n_iterations, stop, self._progress
+        )
         with self._turn:
             self._record(stop_reason=reason)
 

@@ -4,32 +4,25 @@ By Bayes' rule, the posterior of an earlier campaign, taken as the prior of a ne
 posterior given the missions of both. The earlier missions therefore enter every fit.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
-import xarray as xr
-
+from trustbo.campaign.result import Result
 from trustbo.campaign.state import EarlierMissions, why_never_learned
 from trustbo.data import Mission
 from trustbo.display import joined
 from trustbo.errors import TrustboError, require_list
-from trustbo.files import to_json
 from trustbo.hazard.trials import LostMission
-from trustbo.logs.netcdf import missions_from_tree, missions_to_tree
 from trustbo.stacking import names_of_all, pooled
 from trustbo.workspace import Workspace
 from trustbo.workspace.identity import map_name
-
-if TYPE_CHECKING:
-    from trustbo.campaign.result import Result
 
 _REMEDY = "give a result or campaign, or a list of them"
 
 
 def earlier_missions(
-    earlier: "Result | Sequence[Result] | None", workspace: Workspace
+    earlier: Result | Sequence[Result] | None, workspace: Workspace
 ) -> EarlierMissions:
     """Collect the missions of earlier campaigns for a campaign in a workspace.
 
@@ -41,9 +34,6 @@ def earlier_missions(
         TrustboError: An entry is not a result, its features differ from the workspace's, none of
             its robots has a name in the workspace's team, or it has no mission to learn from.
     """
-    # Imported here because results have earlier missions themselves.
-    from trustbo.campaign.result import Result
-
     if earlier is None:
         return EarlierMissions()
     results = [earlier] if isinstance(earlier, Result) else earlier
@@ -79,7 +69,7 @@ def earlier_missions(
     )
 
 
-def _missions_of(result: "Result") -> EarlierMissions:
+def _missions_of(result: Result) -> EarlierMissions:
     """Return the missions of a result to learn from, starting with its own earlier ones."""
     state = result.state
     own = [entry.mission for entry in state.entries if entry.exclusion is None]
@@ -129,7 +119,7 @@ def _without_repeats[T](
 
 
 def _require_alike(
-    what: str, result: "Result", missions: Sequence[Mission], workspace: Workspace
+    what: str, result: Result, missions: Sequence[Mission], workspace: Workspace
 ) -> None:
     """Raise TrustboError unless missions of a result can be fitted with those in a workspace."""
     if all(why_never_learned(mission) for mission in missions):
@@ -148,21 +138,3 @@ def _require_alike(
             f"{what} has the robots {joined(robots)}, and none of {joined(workspace.team.names)}; "
             "robots are matched by name, so name at least one of them alike."
         )
-
-
-def earlier_to_tree(earlier: EarlierMissions) -> xr.DataTree:
-    """Convert earlier missions to a data tree."""
-    tree = missions_to_tree(earlier.missions)
-    tree.attrs["lost"] = to_json([mission._asdict() for mission in earlier.lost])
-    return tree
-
-
-def earlier_from_tree(tree: xr.DataTree) -> EarlierMissions:
-    """Restore earlier missions from a data tree made by `earlier_to_tree`."""
-    lost = []
-    records: list[dict[str, Any]] = json.loads(tree.attrs["lost"])
-    for record in records:
-        path = tuple((row, col) for row, col in record["path"])
-        where = record["where"]
-        lost.append(LostMission(path, None if where is None else tuple(where)))
-    return EarlierMissions(tuple(missions_from_tree(tree)), tuple(lost))

@@ -14,16 +14,16 @@ contains is recorded. A mission is recorded before the posterior is computed. If
 between, `Campaign.load` computes it.
 """
 
+import json
 import os
 from collections.abc import Callable, Container, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import xarray as xr
 
-from trustbo.campaign.earlier import earlier_to_tree
 from trustbo.campaign.lock import FolderLock
 from trustbo.campaign.record import (
     DIFFICULTY,
@@ -45,7 +45,7 @@ from trustbo.campaign.replace import (
     recover,
     remove_tree,
 )
-from trustbo.campaign.state import Entry, Posterior, State
+from trustbo.campaign.state import EarlierMissions, Entry, Posterior, State
 from trustbo.errors import TrustboError, warn
 from trustbo.files import (
     FilePath,
@@ -56,7 +56,8 @@ from trustbo.files import (
     to_path,
     write_file,
 )
-from trustbo.logs.netcdf import missions_to_tree, tree_to_bytes
+from trustbo.hazard.trials import LostMission
+from trustbo.logs.netcdf import missions_from_tree, missions_to_tree, tree_to_bytes
 from trustbo.planning.plan import plan_to_record
 from trustbo.workspace import Workspace
 from trustbo.workspace.netcdf import difficulty_to_tree, workspace_to_tree
@@ -324,3 +325,21 @@ def _version_of(file: Path) -> tuple[int, int, int] | None:
     except OSError:
         return None
     return found.st_ino, found.st_mtime_ns, found.st_size
+
+
+def earlier_to_tree(earlier: EarlierMissions) -> xr.DataTree:
+    """Convert earlier missions to a data tree."""
+    tree = missions_to_tree(earlier.missions)
+    tree.attrs["lost"] = to_json([mission._asdict() for mission in earlier.lost])
+    return tree
+
+
+def earlier_from_tree(tree: xr.DataTree) -> EarlierMissions:
+    """Restore earlier missions from a data tree made by `earlier_to_tree`."""
+    lost = []
+    records: list[dict[str, Any]] = json.loads(tree.attrs["lost"])
+    for record in records:
+        path = tuple((row, col) for row, col in record["path"])
+        where = record["where"]
+        lost.append(LostMission(path, None if where is None else tuple(where)))
+    return EarlierMissions(tuple(missions_from_tree(tree)), tuple(lost))

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from trustbo.campaign.earlier import earlier_from_tree
+from trustbo.campaign.folder import earlier_from_tree
 from trustbo.campaign.learning import as_learned
 from trustbo.campaign.lock import FolderLock
 from trustbo.campaign.record import (

@@ -1,10 +1,10 @@
 """Missions of a campaign in a simulator."""
 
 import json
-from collections.abc import Generator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Generator
+from typing import Any
 
-from trustbo.campaign.result import in_a_line
+from trustbo.campaign.result import Result, in_a_line
 from trustbo.campaign.settings import name_of
 from trustbo.campaign.stopping import Stop
 from trustbo.data import Mission
@@ -16,11 +16,8 @@ from trustbo.planning import Plan
 from trustbo.simulation import KinematicSimulator, RealtimeAwareness
 from trustbo.simulation.protocol import Simulator
 
-if TYPE_CHECKING:
-    from trustbo.campaign.campaign import Campaign
 
-
-def require_simulator(campaign: "Campaign", simulator: Simulator | None) -> Simulator:
+def require_simulator(campaign: Result, simulator: Simulator | None) -> Simulator:
     """Return the simulator of a campaign; by default, the kinematic one.
 
     The default robots measure awareness if the campaign learns from it. Raises TrustboError for
@@ -45,7 +42,9 @@ def settings_of(simulator: Simulator, n_iterations: int) -> dict[str, Any]:
 
 
 def run_missions(
-    campaign: "Campaign",
+    campaign: Result,
+    ask: Callable[[], Plan],
+    tell: Callable[..., Any],
     simulator: Simulator,
     n_iterations: int,
     stop: Stop | None,
@@ -56,18 +55,18 @@ def run_missions(
     with progress_bar(progress, **options) as bar, refreshing(bar):
         # Check the rule before each mission: it may already apply when a campaign is resumed.
         while not (reason := _reason_to_end(campaign, n_iterations, stop)):
-            plan = campaign.ask()
+            plan = ask()
             n = len(campaign.state.entries)
             seed = campaign.state.seed_of("mission")
             mission = simulator.run(plan.path, seed=seed, mission=n)
-            campaign.tell(mission, again=True)  # a simulator without noise may repeat itself
+            tell(mission, again=True)  # a simulator without noise may repeat itself
             bar.set_postfix_str(in_a_line(campaign.state.row(n)), refresh=False)
             bar.update()
             yield plan, mission
     return reason
 
 
-def _reason_to_end(campaign: "Campaign", n_iterations: int, stop: Stop | None) -> str | None:
+def _reason_to_end(campaign: Result, n_iterations: int, stop: Stop | None) -> str | None:
     """Return the reason to stop, or None to continue."""
     n = len(campaign.state.entries)
     if n and stop is not None:

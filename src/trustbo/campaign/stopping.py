@@ -2,18 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_share
 from trustbo.planning import InfeasibleError
 from trustbo.workspace.moves import bounds_and_next
 
-if TYPE_CHECKING:
-    from trustbo.campaign.campaign import Campaign
-
-Stop = Callable[["Campaign"], str | bool | None]
+Stop = Callable[[Result], str | bool | None]
 """Function called between missions; returning a reason (or True) ends the campaign."""
 
 _N_DRAWS = 500
@@ -60,7 +57,7 @@ class RegretBound:
         for name, value in (("eps", self.eps), ("delta", self.delta)):
             require_share(f"RegretBound.{name}", value, ends=False)
 
-    def __call__(self, campaign: "Campaign") -> str | None:
+    def __call__(self, campaign: Result) -> str | None:
         """Return the reason to stop, or None."""
         n = len(campaign.state.entries)
         if n <= _N_SURE:
@@ -77,7 +74,7 @@ class RegretBound:
             return None
         return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"
 
-    def probability(self, campaign: "Campaign", n_missions: int) -> float:
+    def probability(self, campaign: Result, n_missions: int) -> float:
         """Compute P(regret of the recommended path <= eps) after the first `n_missions`."""
         posterior = campaign.state.entries[n_missions - 1].posterior
         if posterior is None:
