@@ -47,7 +47,7 @@ import trustbo as tb
 from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.functions.data import arrays_of, data_of
 from trustbo.inference.functions.draws import draws_of_drift, function_drift
-from trustbo.inference.functions.function import as_model
+from trustbo.inference.functions.known import as_model
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.observations import Observations
 from trustbo.study import run_grid

@@ -15,7 +15,7 @@ from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import add_latent, compare, fit, loo
 from trustbo.inference.functions.fit import log_likelihood_of_function
-from trustbo.inference.functions.function import as_model
+from trustbo.inference.functions.known import as_model
 from trustbo.models import ContactRate, HierarchicalTrust, PooledTrust, Priors
 
 N_TICKS = 40

@@ -13,7 +13,7 @@ from numpyro.contrib.control_flow import cond, scan
 import trustbo as tb
 from trustbo.inference.functions.checks import require_fittable
 from trustbo.inference.functions.data import data_of
-from trustbo.inference.functions.function import as_model
+from trustbo.inference.functions.known import as_model
 from trustbo.models import ContactRate
 from trustbo.models.observations import Observations
 

@@ -11,7 +11,7 @@ import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference.functions.data import data_of
 from trustbo.inference.functions.effects import AddedEffects
-from trustbo.inference.functions.function import as_model
+from trustbo.inference.functions.known import as_model
 from trustbo.inference.functions.sampling import keys_of, targets_of
 from trustbo.models import ContactRate, PlaceEffect, PooledTrust, RobotEffect, TrustParams
 from trustbo.models.observations import Observations

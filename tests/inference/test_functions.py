@@ -23,7 +23,7 @@ import trustbo as tb
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.inference import params_of
 from trustbo.inference.functions.data import data_of
-from trustbo.inference.functions.function import as_model, model_of_record
+from trustbo.inference.functions.known import as_model, model_of_record
 from trustbo.inference.functions.sampling import _judge as judge
 from trustbo.inference.functions.sampling import targets_of
 from trustbo.inference.nuts import Samples

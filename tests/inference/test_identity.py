@@ -18,8 +18,8 @@ import pytest
 from numpyro.handlers import reparam
 
 import trustbo as tb
-from trustbo.inference.functions.function import as_model
 from trustbo.inference.functions.identity import constants_of, fingerprint
+from trustbo.inference.functions.known import as_model
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 
 CODE = """

@@ -24,7 +24,7 @@ from trustbo.campaign.settings import to_planner
 from trustbo.campaign.state import Entry, State
 from trustbo.errors import TrustboError, warn
 from trustbo.files import FilePath, to_path
-from trustbo.inference.functions.function import is_of_function
+from trustbo.inference.functions.known import is_of_function
 from trustbo.inference.learner import Learner, Model, learner_from_record
 from trustbo.logs.netcdf import missions_from_tree, read_tree
 from trustbo.planning.plan import plan_from_record

@@ -14,7 +14,7 @@ from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import TrustboError, require_count, require_kind, require_whole
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.functions.data import require_same_order
-from trustbo.inference.functions.function import is_of_function
+from trustbo.inference.functions.known import is_of_function
 from trustbo.inference.place_maps import (
     in_order_of_places,
     place_group,

@@ -22,7 +22,7 @@ from trustbo.inference.classes import OfClass
 from trustbo.inference.density import Coefficients, Density, JointDraws
 from trustbo.inference.draws import as_fitted, names_in, stored_draws
 from trustbo.inference.functions.fit import fit_function, require_poolable_with_function
-from trustbo.inference.functions.function import as_model
+from trustbo.inference.functions.known import as_model
 from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
 from trustbo.inference.importance import MAX_KHAT, Points, Student, sample
 from trustbo.inference.latent import N_PRIOR

@@ -32,12 +32,8 @@ from trustbo.inference.functions.fit import (
     require_plannable,
     require_poolable_with_function,
 )
-from trustbo.inference.functions.function import (
-    FunctionModel,
-    as_model,
-    is_of_function,
-    model_of_record,
-)
+from trustbo.inference.functions.function import FunctionModel
+from trustbo.inference.functions.known import as_model, is_of_function, model_of_record
 from trustbo.inference.functions.sampling import NUTS
 from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
 from trustbo.inference.functions.source import FunctionData, OfFunction

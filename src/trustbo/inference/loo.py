@@ -34,7 +34,7 @@ from trustbo.inference.density import at
 from trustbo.inference.draws import as_fitted, missions_of, names_in, read_posterior
 from trustbo.inference.fit import fit
 from trustbo.inference.functions.fit import log_likelihood_of_function
-from trustbo.inference.functions.function import as_model, is_of_function, model_of_record
+from trustbo.inference.functions.known import as_model, is_of_function, model_of_record
 from trustbo.inference.importance import MAX_KHAT
 from trustbo.inference.learner import Model, add_latent
 from trustbo.inference.tree import LIKELIHOOD_OF, RATES, TICKS

@@ -2,7 +2,6 @@
 
 import inspect
 import json
-from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -12,12 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro import handlers
 from numpyro.distributions import (
-    Delta,
-    ExpandedDistribution,
-    Independent,
-    MaskedDistribution,
     Normal,
-    TransformedDistribution,
     biject_to,
 )
 from numpyro.distributions.distribution import Unit
@@ -31,15 +25,14 @@ from trustbo.inference.functions.data import NAMES, RATES, Data, arrays_of
 from trustbo.inference.functions.explain import explained
 from trustbo.inference.functions.identity import constants_of, fingerprint, name_of
 from trustbo.inference.functions.plates import WholePlates
+from trustbo.inference.functions.refusals import base_of, require_rates
 from trustbo.inference.functions.sites import (
     Site,
     axes_that_differ,
     computed_site,
     doubled,
-    has_prior,
     latent_in,
     plates_of_rates,
-    safe,
     site_of,
 )
 from trustbo.models.backend import own_settings
@@ -53,18 +46,8 @@ EFFECTS = "effects on the drift"
 """Name of the sum of the effects among the values of `FunctionModel.evaluate`."""
 KIND = "function"
 """Value of the entry `class` in the record of a model that is a function."""
-_HOW = (
-    'End it with numpyro.sample("contact_rate", tb.models.ContactRate(drift, beta0, delta_w, '
-    "delta_v), obs=contact_rate)."
-)
-_MOST_KNOWN = 64
-"""Number of functions that are remembered, together with their compiled code."""
-_CHANGED = ExpandedDistribution | Independent | MaskedDistribution
-"""Distributions that change the shape or the mask of another one, `base_dist`."""
 _MOST_TRACED = 16
 """Number of shapes of data whose traces are kept."""
-_AXES = ("chain", "draw")
-"""Names that no variable may have."""
 
 
 class Found(NamedTuple):
@@ -286,7 +269,7 @@ class FunctionModel:
             whole = WholePlates(self.call, owner=self.in_short())
             found = handlers.trace(handlers.seed(whole, key)).get_trace(inputs)
             trace.update(found)
-            self._require_rates(found, data)
+            require_rates(self.in_short(), found, data)
             self._require_sites_again(found, key, inputs)
             return {
                 name: biject_to(found[name]["fn"].support).inv(found[name]["value"])
@@ -354,109 +337,6 @@ class FunctionModel:
         except Exception:
             return
 
-    def _require_rates(self, trace: Mapping[str, Any], data: Data) -> None:
-        """Raise TrustboError unless the site `contact_rate` is the state space of the missions."""
-        self._require_no_obs_mask(trace)
-        site = trace.get(RATES)
-        if site is None or site["type"] != "sample":
-            names = [f"{name!r}" for name, one in trace.items() if one["type"] == "sample"]
-            sites = f"only {joined(names)}" if names else "no site at all"
-            raise TrustboError(f"{self.in_short()} has no site 'contact_rate', {sites}. {_HOW}")
-
-        rates = self._require_contact_rate(site["fn"])
-        if not site["is_observed"]:
-            raise TrustboError(
-                f"the site 'contact_rate' of {self.in_short()} is not observed; pass "
-                "obs=contact_rate."
-            )
-
-        shape = np.shape(data[RATES])
-        given = (*rates.batch_shape, *rates.event_shape)
-        if given != shape:
-            remedy = ""
-            if given[2] == 1:
-                remedy = " Add the axis of the robots: drift + jnp.zeros(awareness.shape[:3])."
-            raise TrustboError(
-                f"the drift of {self.in_short()} must have the shape (mission, bound, robot) = "
-                f"{shape}, as awareness is (mission, bound, robot, feature) = "
-                f"{np.shape(data['awareness'])}; got {given}.{remedy}"
-            )
-
-        self._require_variables(trace)
-
-    def _require_no_obs_mask(self, trace: Mapping[str, Any]) -> None:
-        """Raise TrustboError for a site with `obs_mask`, which NumPyro splits into two sites.
-
-        Entries that are observed have no density at the second site, so NUTS would not find them.
-        """
-        for name, one in trace.items():
-            parts = [trace.get(f"{name}_{part}") for part in ("observed", "unobserved")]
-            if one["type"] != "deterministic" or None in parts:
-                continue
-
-            remedy = "set values that are to be left out to NaN in the missions"
-            if name != RATES:
-                remedy = (
-                    "leave values out with numpyro.handlers.mask(mask=obs_mask), and sample those "
-                    "that are missing at another site"
-                )
-            raise TrustboError(
-                f"the site {name!r} of {self.in_short()} has an obs_mask, which NumPyro does not "
-                f"support for NUTS; {remedy}."
-            )
-
-    def _require_contact_rate(self, rates: Any) -> ContactRate:
-        """Return the distribution of the rates; raise TrustboError unless it is a ContactRate."""
-        if isinstance(rates, ContactRate):
-            return rates
-
-        where = f"the site 'contact_rate' of {self.in_short()}"
-        rates = _base_of(rates)
-        if isinstance(rates, ContactRate):
-            raise TrustboError(
-                f"{where} has a ContactRate that was changed by expand, mask or to_event; give a "
-                "drift of the shape (mission, bound, robot), and set rates that are to be left out "
-                "to NaN in the missions."
-            )
-        raise TrustboError(
-            f"{where} has the distribution {type(rates).__name__}; it must be "
-            f"tb.models.ContactRate. {_HOW}"
-        )
-
-    def _require_variables(self, trace: Mapping[str, Any]) -> None:
-        """Raise TrustboError for sites whose kind or name is not allowed in a posterior."""
-        taken: dict[str, str] = {}
-        for name, one in trace.items():
-            free = one["type"] == "sample" and not one["is_observed"]
-            named = free or one["type"] == "deterministic"
-            if free and isinstance(_base_of(one["fn"], _CHANGED | TransformedDistribution), Delta):
-                raise TrustboError(
-                    f"the site {name!r} of {self.in_short()} has the distribution Delta, whose "
-                    "single value NUTS cannot sample; use the value itself, and "
-                    "numpyro.deterministic to record it."
-                )
-            if free and one["fn"].support.is_discrete:
-                raise TrustboError(
-                    f"the site {name!r} of {self.in_short()} is discrete, and NUTS samples "
-                    "continuous variables only; sum over its values."
-                )
-            if named and name in _AXES:
-                raise TrustboError(
-                    f"the site {name!r} of {self.in_short()} has the name of an axis of "
-                    "posteriors; give it another name."
-                )
-            if named and taken.setdefault(safe(name), name) != name:
-                raise TrustboError(
-                    f"the sites {taken[safe(name)]!r} and {name!r} of {self.in_short()} would have "
-                    f"the same name {safe(name)!r} in a posterior; rename one of them."
-                )
-            if one["type"] == "param" and not has_prior(name, trace):
-                raise TrustboError(
-                    f"the site {name!r} of {self.in_short()} is a parameter to optimise "
-                    "(numpyro.param, flax_module), which NUTS leaves at its initial value; use "
-                    "numpyro.sample or random_flax_module."
-                )
-
     # --- functions that are compiled once for each shape of their arguments ---
 
     def potential(self, z: Mapping[str, Any], data: Data, deviations: Collection[str] = ()) -> Any:
@@ -518,7 +398,7 @@ class FunctionModel:
     def scales(self, key: jax.Array, data: Data) -> dict[str, Any]:
         """Return the means and standard deviations of normal variables, for a draw of the prior."""
         trace = self._trace({}, key, data)
-        bases = {name: _base_of(trace[name]["fn"]) for name in latent_in(trace)}
+        bases = {name: base_of(trace[name]["fn"]) for name in latent_in(trace)}
         return {name: (b.loc, b.scale) for name, b in bases.items() if isinstance(b, Normal)}
 
     def prior(self, key: jax.Array, data: Data) -> dict[str, Any]:
@@ -662,87 +542,9 @@ def _transform_of(site: Mapping[str, Any], deviations: Collection[str]) -> Any:
     standard deviations.
     """
     if site["name"] in deviations:
-        base = _base_of(site["fn"])
+        base = base_of(site["fn"])
         return AffineTransform(base.loc, base.scale)
     return biject_to(site["fn"].support)
-
-
-_KNOWN: OrderedDict[str, FunctionModel] = OrderedDict()
-"""Models of functions by fingerprint, with the most recently used model last."""
-
-
-def _base_of(distribution: Any, changed: Any = _CHANGED) -> Any:
-    """Return the distribution to which others of the kinds `changed` refer."""
-    while isinstance(distribution, changed):
-        distribution = distribution.base_dist
-    return distribution
-
-
-def as_model(function: Callable[..., Any] | FunctionModel) -> FunctionModel:
-    """Return the model of a function; the same function always gives the same model.
-
-    Raises TrustboError if the function cannot be a model; see `FunctionModel`.
-    """
-    if isinstance(function, FunctionModel):
-        return function
-
-    model = FunctionModel(function)
-    known = _KNOWN.get(model.fingerprint)
-    if known is not None and known.function == function:
-        model = known
-
-    _KNOWN[model.fingerprint] = model
-    _KNOWN.move_to_end(model.fingerprint)
-    if len(_KNOWN) > _MOST_KNOWN:
-        _KNOWN.popitem(last=False)
-    return model
-
-
-def model_of_record(
-    record: Mapping[str, Any], given: Callable[..., Any] | FunctionModel | None = None
-) -> FunctionModel:
-    """Return the model that a record describes, if it is given or was used in this process.
-
-    Raises:
-        TrustboError: If the function is not known, or if a different one is given.
-    """
-    if given is not None:
-        model = as_model(given)
-        if model.record() != dict(record):
-            raise TrustboError(
-                f"the posterior is of the function {record['name']!r} with the hash "
-                f"{record['sha256']}, not of {model.name!r} with the hash {model.fingerprint}"
-                f"{_difference(model, record)}. Give the same function, with the same constants, "
-                "or fit again."
-            )
-        return model
-
-    model = _KNOWN.get(record["sha256"])
-    if model is None:
-        raise TrustboError(
-            f"the posterior is of the NumPyro function {record['name']!r}, which is not stored; "
-            "give it with model=."
-        )
-    return model
-
-
-def _difference(model: FunctionModel, record: Mapping[str, Any]) -> str:
-    """State which constants of a function differ from those in a record, or that the code does."""
-    if model.name != record["name"]:
-        return ""
-
-    own = model.record()["constants"]
-    stored = record.get("constants", {})
-    names = sorted(name for name in {**own, **stored} if own.get(name) != stored.get(name))
-    if not names:
-        return ", whose code or use of functools.partial differs"
-    is_are = "constant" if len(names) == 1 else "constants"
-    return f", whose {is_are} {joined(names)} differ{'s' if len(names) == 1 else ''}"
-
-
-def is_of_function(record: Mapping[str, Any]) -> bool:
-    """Return whether a record describes a model that is a function."""
-    return record["class"] == KIND
 
 
 def _inputs_of(function: Callable[..., Any], name: str) -> tuple[str, ...]:
