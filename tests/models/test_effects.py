@@ -1,5 +1,8 @@
 """Columns and priors of effects against their equations, written out rate by rate."""
 
+import json
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from missions import walking_missions
@@ -7,6 +10,7 @@ from missions import walking_missions
 from trustbo.data import Mission
 from trustbo.inference.fit import fit
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect
+from trustbo.models.record import effects_from_record, model_to_record
 
 N_MISSIONS = 4
 N_ROBOTS = 3
@@ -179,3 +183,16 @@ def test_a_robot_s_effect_in_the_next_mission_is_normal_given_the_missions_befor
         np.testing.assert_allclose(of_draws.std(0), sd, rtol=5.0 / np.sqrt(2 * n_draws))
         error = np.abs(of_draws.mean(0) - expected[point])
         assert (error < 5.0 * sd / np.sqrt(n_draws)).all()
+
+
+@dataclass(frozen=True)
+class Payload(RobotEffect):
+    """Effect with nested settings."""
+
+    kg: tuple[tuple[float, ...], ...] = ()
+
+
+def test_an_effect_with_nested_settings_is_rebuilt_as_it_was():
+    model = PooledTrust(effects=[Payload(kg=((1.0, 2.0), (3.0, 4.0)))])
+    record = json.loads(json.dumps(model_to_record(model)))
+    assert {*effects_from_record(record)} == {*model.effects}  # effects are keys of dicts

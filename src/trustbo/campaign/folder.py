@@ -10,8 +10,14 @@
 
 Files are only added; campaign.json, which lists them with their hashes, is replaced. Every file is
 written under a temporary name, flushed to disk and renamed, and campaign.json comes last: what it
-contains is recorded. A mission is recorded before the posterior is computed. If the process dies in
-between, `Campaign.load` computes it.
+contains is recorded. If the process dies during `tell`, the following happens:
+
+    before the file of the mission exists   nothing is recorded; tell the mission again
+    before campaign.json lists the mission  nothing is recorded; `Campaign.load` warns, and the next
+                                            `tell` sets the file aside as `.unrecorded`
+    before campaign.json lists its posterior
+                                            the mission is recorded; `Campaign.load` computes the
+                                            same posterior, with the same seed
 """
 
 import json

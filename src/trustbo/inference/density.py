@@ -324,7 +324,7 @@ class Density:
             return ep.nearby(joint, self.near), joint.prior
 
         predictor, prior = self.given(theta)
-        return evidence(self.blocks, predictor, prior, self.site_precision(predictor)), prior
+        return evidence(self.blocks, predictor, prior, self.rate_precision(predictor)), prior
 
     def given(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
         """Return the distribution of the linear predictors and the prior at each theta."""
@@ -332,8 +332,12 @@ class Density:
         predictor = self.model.linear_predictor(theta, self.observations, self.layout)
         return predictor, self.prior(theta)
 
-    def site_precision(self, predictor: LinearPredictor) -> Any:
-        """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured."""
+    def rate_precision(self, predictor: LinearPredictor) -> Any:
+        """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured.
+
+        Here, the noise of a measured rate enters: its sd is `delta_v`, to which `TrustModel.theta`
+        adds the resolution of the rate.
+        """
         return self.blocks.seen / predictor.noise_sd**2
 
     def _joint(self, theta: Theta) -> ep.Joint:

@@ -5,8 +5,9 @@ block has trust x and a predictor f,
 
     x = m + T U c + e,    f = x + n,    e ~ N(0, S),  n ~ N(0, noise),  c ~ N(mean, precision^-1),
 
-where every observation is a Gaussian site N(y; f, 1 / lam). Sites are exact for Gaussian rates. For
-other families, they are found by expectation propagation (`ep`). With
+where every observation is a Gaussian site N(y; f, 1 / lam), and `noise` is what robots share. For
+Gaussian rates, 1 / lam is the variance of the noise of each rate (`Density.rate_precision`). For
+other families, sites are found by expectation propagation (`ep`). With
 L L' = 1 + lam^1/2 (S + noise) lam^1/2 and W = L^-1 lam^1/2, the model is a regression of W (y - m)
 on W T U with unit noise. Products of columns for pairs of inputs, summed over the blocks of one
 kind, do not depend on theta. Therefore, one sparse product suffices to compute U' (W T)' (W T) U

@@ -78,7 +78,7 @@ def _slopes_of_arrays(density: Density, z: np.ndarray) -> tuple[np.ndarray, list
     """
     predictor, prior = density.given(density.theta(z))
     b = density.blocks
-    fit = evidence(b, predictor, prior, density.site_precision(predictor))
+    fit = evidence(b, predictor, prior, density.rate_precision(predictor))
     n = len(z)
     T = each(predictor.response, b.label)
     T_of = each(T, b.kind)

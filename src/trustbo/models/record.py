@@ -70,7 +70,7 @@ def effects_from_record(record: Mapping[str, Any]) -> tuple[Effect, ...]:
     """
     effects = []
     for one in record.get("effects", ()):
-        settings = {n: tuple(v) if isinstance(v, list) else v for n, v in one.items()}
+        settings = {name: _as_tuple(value) for name, value in one.items()}
         kind = settings.pop("kind")
         if kind not in EFFECTS:
             raise TrustboError(
@@ -80,3 +80,8 @@ def effects_from_record(record: Mapping[str, Any]) -> tuple[Effect, ...]:
         effects.append(EFFECTS[kind](**settings))
 
     return tuple(effects)
+
+
+def _as_tuple(value: Any) -> Any:
+    """Return a setting in which lists, as read from a file, are tuples, so that it has a hash."""
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
