@@ -350,12 +350,21 @@ def _in_order(
             names[axis] = of_axis
             names[f"{axis}_"] = of_axis  # second axis of a matrix, or of means over robots
 
+    given = {name: group.to_dataset() for name, group in posterior.children.items()}
     groups = {}
-    for name, group in posterior.children.items():
-        ordered = in_order("the posterior", group.to_dataset(), names)
+    for name, group in given.items():
+        ordered = in_order("the posterior", group, names)
         if name == "places":
             ordered = in_order_of_places(ordered)
         groups[name] = transposed(ordered, dims if name in _OF_VARIABLES else {})
+
+    # Building a tree takes longer than all checks, and posteriors are usually in order.
+    same_names = [tuple(robots), tuple(features)] == [
+        names_in(posterior, "robot"),
+        names_in(posterior, "feature"),
+    ]
+    if same_names and all(groups[name] is group for name, group in given.items()):
+        return posterior
 
     whole = xr.DataTree.from_dict(groups)
     whole.attrs = posterior.attrs | {"robots": list(robots), "features": list(features)}
@@ -395,7 +404,7 @@ def transposed(group: xr.Dataset, dims: Mapping[str, Sequence[str]]) -> xr.Datas
             axes = ("chain", "draw", *dims[str(name)])
         if axes != array.dims and set(axes) == set(array.dims):
             turned[name] = array.transpose(*axes)
-    return group.assign(turned)
+    return group.assign(turned) if turned else group
 
 
 def _position(axis: Hashable) -> int:
