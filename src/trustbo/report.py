@@ -74,12 +74,13 @@ def write_report(path: FilePath, result: Result) -> None:
     """
     require_kind("result", result, Result, "give a result or a campaign")
     posterior = result.posterior  # raises if there is none yet
+    path_table = bounds_of(result)
     page = render(
         "report.html",
         result=result,
         facts=facts_of(result),
-        pictures=_pictures(result),
-        tables=_tables(result),
+        pictures=_pictures(result, path_table),
+        tables=_tables(result, path_table),
         replanned=result.table()["replanned"].any(),
         sampler=posterior.attrs.get("sampler", "unknown"),
     )
@@ -89,10 +90,11 @@ def write_report(path: FilePath, result: Result) -> None:
 def facts_of(result: Result) -> dict[str, str]:
     """Return the facts, by name, that are needed to decide whether to drive the path."""
     plan = result.plan
-    bounds = bounds_of(result).iloc[1:]
+    path = bounds_of(result)
+    bounds = path.iloc[1:]
     rate = float(result.history["contact_rate"][-1])
     last = f"{rate:.1%} of the time" if np.isfinite(rate) else "not measured"
-    cells = " → ".join(bounds_of(result)["cell"])
+    cells = " → ".join(path["cell"])
     facts = {
         "Path": f"{cells} (row,column; row 0 is north)",
         "Length": f"{len(bounds)} bounds, {plan.length:.0f} m",
@@ -187,8 +189,11 @@ def _number(value: float) -> str:
     return f"{value:z.3g}"
 
 
-def _pictures(result: Result) -> dict[str, str]:
-    """Draw all figures, keyed by name; without a terrain, there are no posts."""
+def _pictures(result: Result, path_table: pd.DataFrame) -> dict[str, str]:
+    """Draw all figures, keyed by name; without a terrain, there are no posts.
+
+    `path_table` is the table of `bounds_of`.
+    """
     plan = result.plan
     sd = result.maps(n_draws=_DRAWS)["trust_sd"]
     draw: dict[str, Callable[[], Any]] = {
@@ -198,8 +203,7 @@ def _pictures(result: Result) -> dict[str, str]:
         "sd": lambda: plots.cell_map(sd, result.workspace, path=plan.path),
     }
     if plan.stops is not None:
-        bounds = bounds_of(result).iloc[1:]
-        weakest = bounds.nsmallest(_SHOWN, "contact").index
+        weakest = path_table.iloc[1:].nsmallest(_SHOWN, "contact").index
         draw["path"] = lambda: plots.plan_map(plan, bounds=[])
         draw["weakest"] = lambda: plots.plan_map(plan, bounds=sorted(weakest))
     return {name: _picture(figure) for name, figure in draw.items()}
@@ -215,9 +219,9 @@ def _picture(draw: Callable[[], Any]) -> str:
     return base64.b64encode(file.getvalue()).decode()
 
 
-def _tables(result: Result) -> dict[str, str]:
-    """Return all tables as HTML, keyed by name."""
-    bounds: Any = bounds_of(result).astype({"begun": object})
+def _tables(result: Result, path_table: pd.DataFrame) -> dict[str, str]:
+    """Return all tables as HTML, keyed by name; `path_table` is the table of `bounds_of`."""
+    bounds: Any = path_table.astype({"begun": object})
     bounds.loc[0, "begun"] = "start"
     bounds[["x", "y"]] = bounds[["x", "y"]].map("{:.1f}".format)
     bounds = bounds[[name for name in _OF_BOUNDS if name in bounds]].rename(columns=_OF_BOUNDS)

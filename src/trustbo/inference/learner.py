@@ -317,10 +317,9 @@ def add_latent(
         >>> tb.inference.add_latent(posterior)["latent"]["trust_mean"].dims
         ('mission', 'bound', 'robot')
     """
-    given = posterior
-    posterior = as_fitted("add_latent", given)
-    if "latent" in given.children:
-        return given
+    posterior = as_fitted("add_latent", posterior)
+    if "latent" in posterior.children:
+        return posterior
 
     missions = missions_of(posterior) if missions is None else missions
     missions = in_order_of_features(missions, posterior)
