@@ -11,6 +11,7 @@ from trustbo.arrays import evenly_spaced
 from trustbo.inference import ep
 from trustbo.inference.density import Density, JointDraws, at
 from trustbo.inference.draws import parameters_of
+from trustbo.inference.engine import inputs
 from trustbo.inference.latent import (
     N_PRIOR,
     N_TRAJECTORIES,
@@ -66,11 +67,11 @@ class OfClass(Source):
         for start in range(0, len(some), _CHUNK):
             index = some[start : start + _CHUNK]
             draws = self.draws.at(index)
-            inputs = (self._U @ draws.c.T).T.reshape(len(index), len(self.label), -1)
-
             model = self.density.model
             predictor = model.linear_predictor(draws.theta, self.observations, self.layout)
-            yield Given(index, predictor, predictor.mean_given(inputs, self.label))
+
+            u = inputs(self._U, len(self.label), draws.c)
+            yield Given(index, predictor, predictor.mean_given(u, self.label))
 
     def draw(
         self, given: Given, rng: np.random.Generator

@@ -355,15 +355,14 @@ def whiten(label: np.ndarray, predictor: LinearPredictor, lam: Any) -> tuple[Any
     return np.linalg.inv(L) * d[..., None, :], log_sites - log_diagonal(L)
 
 
-def inputs(blocks: Blocks, c: np.ndarray) -> np.ndarray:
+def inputs(U: Any, n_blocks: int, c: np.ndarray) -> np.ndarray:
     """Compute the inputs U c (point, block, input) of all blocks from coefficients (point, c)."""
-    drift = np.ascontiguousarray((blocks.U @ c.T).T)
-    return drift.reshape(len(c), len(blocks.y), -1)
+    return np.ascontiguousarray((U @ c.T).T).reshape(len(c), n_blocks, -1)
 
 
 def expected(blocks: Blocks, predictor: LinearPredictor, c: Any) -> Any:
     """Compute the mean linear predictors (point, block, row) given coefficients (point, column)."""
-    return predictor.mean_given(inputs(blocks, c), blocks.label[blocks.kind])
+    return predictor.mean_given(inputs(blocks.U, len(blocks.y), c), blocks.label[blocks.kind])
 
 
 def coefficients_of(

@@ -87,7 +87,7 @@ def _slopes_of_arrays(density: Density, z: np.ndarray) -> tuple[np.ndarray, list
 
     # Posterior mean of the coefficients, relative to the prior mean, and P e there.
     c = fit.F.back(fit.half[:, None])[:, 0]
-    at_mean = inputs(b, prior.mean + c)
+    at_mean = inputs(b.U, len(b.y), prior.mean + c)
     e = b.y - expected(b, predictor, prior.mean + c)
     Pe = (P[:, b.kind] @ e[..., None])[..., 0]
 
