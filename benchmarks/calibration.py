@@ -33,7 +33,7 @@ workspace or the stored paths have changed.
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -53,8 +53,32 @@ from trustbo.models.draws import Draws
 from trustbo.planning.recursion import trust_recursion
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, bounds_along, moves_along
 
-MODELS: dict[str, Any] = {"default": tb.models.default_model()}
-"""Models that can be compared, keyed by name."""
+
+def as_in_0_5(**changes: Any) -> Callable[[Sequence[str]], tb.models.PooledTrust]:
+    """Return the default model of version 0.5 for some features, with changed settings of effects.
+
+    Each change is a setting of an effect, or `f_v`.
+    """
+
+    def model(features: Sequence[str]) -> tb.models.PooledTrust:
+        settings = {"f_e": 0.0, "tau_lasting": 0.0, "f_v": None} | changes
+        priors = replace(tb.models.Priors.from_features(features), f_v=settings["f_v"])
+        places = tb.models.PlaceEffect(f_e=settings["f_e"])
+        robots = tb.models.RobotEffect(tau_lasting=settings["tau_lasting"])
+        return tb.models.PooledTrust(priors, effects=[places, robots])
+
+    return model
+
+
+_FLOOR = tb.models.Priors.from_features(["line_of_sight"]).f_v
+MODELS: dict[str, Any] = {
+    "default": lambda features: tb.models.default_model(),
+    "as in 0.5": as_in_0_5(),
+    "scales": as_in_0_5(f_e=2.0, f_v=_FLOOR),
+    "scale of effects": as_in_0_5(f_e=2.0),
+    "lasting part": as_in_0_5(tau_lasting=0.3),
+}
+"""Models that can be compared for given features, keyed by name."""
 WORLDS = (
     "synthetic-1", "wellington", "topography", "synthetic-0-wall", "bcts-bare",
     "synthetic-0-aged", "bcts-aged", "tahoe-aged",
@@ -92,6 +116,8 @@ OF_TRUST = ["trust50", "trust90", "rate50", "rate90", "score", "error", "bias", 
             "poor_bias"]  # fmt: skip
 OF_PRIOR = ["prior_in_range", "plan90", "plan_width"]
 MEASURES = [*OF_TRUST, *OF_PRIOR]
+NOWHERE = np.full((1, 3), -1)
+"""Bounds of a model whose noise does not depend on where they are."""
 FIRST = "first plan"
 """Name of the set of measures before any mission."""
 
@@ -305,8 +331,9 @@ def measure(
     for world in chosen:
         for course in courses:
             data = data_of(world, course, folder)
-            world.workspace()  # is kept, and not part of the time of fits
-            for name, model in models.items():
+            features = world.workspace().features  # is kept, and not part of the time of fits
+            for name, make in models.items():
+                model = make(features)
                 started = time.process_time()
                 found = [
                     *rows_of_fit(world, data, model),
@@ -352,8 +379,9 @@ def noise_of(draws: Draws, awareness: np.ndarray) -> np.ndarray:
     """Return the sd of a rate given expected trust, shape (draw, robot or 1, bound or 1)."""
     space = draws.state_space(len(awareness))
     process = np.diagonal(space.process_cov, axis1=-2, axis2=-1)
-    sd = np.sqrt(space.rate_sd**2 + process)
-    return sd.reshape(draws.n_draws, -1)[..., None]
+    n = draws.n_draws
+    own = space.rate_sd.reshape(n, -1, 1) * draws.noise_scale(awareness, NOWHERE)
+    return np.sqrt(own**2 + process.reshape(n, -1, 1))
 
 
 def poor_robots(world: World) -> list[int]:

@@ -77,6 +77,10 @@ class DenseRates:
             self.of_c[:, rows] = response.reshape(n_points, -1, n).mT
             self.trust_cov[:, rows, rows] = cov
             self.noise[:, rows, rows] = noise
+            if "f_v" in theta:
+                of_team = line_of_sight(observations)[j].mean(-1)
+                g = scale_of(np.repeat(of_team, n_robots), theta["f_v"][:, None])
+                self.noise[:, rows, rows] *= g[:, :, None] * g[:, None]
 
     @property
     def mean(self):
@@ -298,23 +302,30 @@ def human_prior(model, observations, theta, bounds, gain):
 
 def place_prior(effect, observations, theta, bounds, gain):
     """A Matern 3/2 process over cells, effects of bounds, and of robots, which sum to 0."""
-    cells, n_bounds = cells_of(bounds), len(bounds_of(bounds))
-    n_contrasts = n_bounds * (observations.contact_rate.shape[2] - 1)
+    cells, places = cells_of(bounds), bounds_of(bounds)
+    n_contrasts = observations.contact_rate.shape[2] - 1
+    sight = line_of_sight(observations)
+    of_bounds = [sight[(bounds == bound).all(-1)].mean() for bound in places]
+    g = scale_of(np.array(of_bounds), theta.get("f_e", 1.0))
     distance = np.linalg.norm(cells[:, None] - cells, axis=2)
     h = np.sqrt(3.0) * distance / theta["length_scale"]
     matern = (1.0 + h) * np.exp(-h) + NUGGET * np.eye(len(cells))
     return [
         (np.zeros(len(cells)), theta["tau_s"] ** 2 * matern),
-        (np.zeros(n_bounds), theta["tau_e"] ** 2 * np.eye(n_bounds)),
-        (np.zeros(n_contrasts), theta["tau_r"] ** 2 * np.eye(n_contrasts)),
+        (np.zeros(len(g)), theta["tau_e"] ** 2 * np.diag(g**2)),
+        (
+            np.zeros(len(g) * n_contrasts),
+            theta["tau_r"] ** 2 * np.diag(np.repeat(g**2, n_contrasts)),
+        ),
     ]
 
 
 def robot_prior(effect, observations, theta, bounds, gain):
-    """A lasting part and a part of one mission, independent between robots."""
+    """A lasting, a slow and a part of one mission, independent between robots."""
     mission = np.arange(len(observations.contact_rate))
-    lasting = effect.rho ** np.abs(mission[:, None] - mission)
-    cov = theta["tau_slow"] ** 2 * lasting + theta["tau_mission"] ** 2 * np.eye(len(mission))
+    slow = effect.rho ** np.abs(mission[:, None] - mission)
+    cov = theta["tau_slow"] ** 2 * slow + theta["tau_mission"] ** 2 * np.eye(len(mission))
+    cov = cov + theta.get("tau_lasting", 0.0) ** 2
     return [(np.zeros(len(mission)), of_robot**2 * cov) for of_robot in gain.of_effects]
 
 
@@ -327,6 +338,11 @@ PRIORS = {
     "RobotEffect": robot_prior,
 }
 """Means and covariances of groups of coefficients, in the order of `INPUTS`."""
+
+
+def scale_of(sight, floor):
+    """Scale of effects and noise, by line of sight m: its square is 4 m (1 - m) from the floor."""
+    return np.sqrt(4.0 * sight * (1.0 - sight) * (1.0 - floor**2) + floor**2)
 
 
 def cells_of(bounds):

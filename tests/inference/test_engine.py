@@ -256,7 +256,9 @@ def log_density_of_rates(model, observations):
     return jax.jit(density), of_coefficients
 
 
-@pytest.mark.parametrize("name", [f"pooled, shared noise, {EVERYTHING}", "coupled"])
+@pytest.mark.parametrize(
+    "name", [f"pooled, {EVERYTHING}", f"pooled, shared noise, {EVERYTHING}", "coupled"]
+)
 def test_slopes_are_those_of_the_density(name):
     posterior, *_ = posterior_of(GAUSSIAN[name], gaps=True)
     require_equal_slopes(posterior)

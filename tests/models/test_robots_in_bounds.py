@@ -19,8 +19,15 @@ def effects():
     column = np.full(SHAPE, -1)
     for k, bound in enumerate(VISITED):
         column[bound] = k
-    tau_r = rng.uniform(0.1, 0.2, N_DRAWS)
-    return RobotsInBounds(known, column, tau_r, np.arange(N_DRAWS), seed=3)
+    return RobotsInBounds(
+        known=known,
+        column=column,
+        tau_r=rng.uniform(0.1, 0.2, N_DRAWS),
+        floor=rng.uniform(0.1, 0.9, N_DRAWS),
+        variation=rng.uniform(size=SHAPE),
+        number=np.arange(N_DRAWS),
+        seed=3,
+    )
 
 
 def test_visited_bounds_have_the_effects_that_are_known(effects):
@@ -32,8 +39,10 @@ def test_other_bounds_have_contrasts_of_independent_normals(effects):
     every = effects.everywhere()
     np.testing.assert_allclose(every.sum(1), 0.0, atol=1e-12)
 
-    # A contrast of n independent normals with standard deviation tau_r is a normal with it.
-    contrast = (every[:, 0] - every[:, 1]) / np.sqrt(2.0) / effects.tau_r[:, None, None, None]
+    # A contrast of n independent normals with standard deviation g tau_r is a normal with it.
+    tau_r, floor = (x[:, None, None, None] for x in (effects.tau_r, effects.floor))
+    sd = tau_r * np.sqrt(floor**2 + (1.0 - floor**2) * effects.variation)
+    contrast = (every[:, 0] - every[:, 1]) / np.sqrt(2.0) / sd
     other = contrast[:, effects.column < 0]
     assert stats.kstest(other.ravel(), "norm").pvalue > 0.001
     for correlation in (np.corrcoef(other.T), np.corrcoef(other)):

@@ -165,7 +165,7 @@ def _predicted(source: Source, some: np.ndarray, seed: int) -> tuple[np.ndarray,
     predicted = []
     for given in source.given(some):
         cov = each(given.predictor.covariance, source.label)
-        sd = each(given.predictor.noise_sd, source.label)
+        sd = given.predictor.noise_sd
         ahead = kalman.one_step_ahead(given.mean, cov, sd, y, n_ticks, likelihood)
         f = ahead.mean + np.sqrt(ahead.var) * rng.standard_normal(given.mean.shape)
         drawn = likelihood.sample(f, sd, n_ticks, rng)

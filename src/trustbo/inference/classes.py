@@ -156,11 +156,11 @@ def log_prior(fitted: Density, parameters: Mapping[str, np.ndarray]) -> dict[str
 
     with_prior = dict(parameters)
     if "delta_v" in parameters:
-        with_prior["delta_v"] = model.noise_without(parameters["delta_v"], resolution)
+        with_prior |= model.noise_without(parameters, resolution)
     densities = {n: log_density(p, with_prior[n]) for n, p in priors.items() if n in parameters}
     for name, (field, values) in model.prior_terms(parameters).items():
         if field == "delta_v":
-            values = model.noise_without(values, resolution)
+            values = model.noise_without({"delta_v": values}, resolution)["delta_v"]
         given = inverse_gain.reshape(*inverse_gain.shape, *(1,) * (values.ndim - inverse_gain.ndim))
         densities[name] = model.priors.log_density(field, values, given)
 

@@ -13,7 +13,7 @@ from trustbo.inference.importance import Student, climb
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
-from trustbo.statespace.blocks import LinearPredictor
+from trustbo.statespace.blocks import LinearPredictor, each
 
 _CHUNK = 32
 """Largest number of points evaluated at once."""
@@ -140,11 +140,14 @@ class Density:
         self.prior = self.columns.prior
         self.exact = model.likelihood.gaussian
 
-        # Which columns depend on each other a priori does not depend on theta, so any will do.
+        # Which columns depend on each other a priori, and which blocks have equal noise, does not
+        # depend on theta, so any will do.
         y = self.layout.rows(observations.contact_rate)
-        prior = self.prior(self.theta(np.zeros((1, self.n_scores))))
+        predictor, prior = self._at(self.theta(np.zeros((1, self.n_scores))))
         U = self.layout.design(self.columns.U)
-        self.blocks = Blocks.from_rows(y, U, self.layout.label, prior=prior, apart=not self.exact)
+        self.blocks = Blocks.from_rows(
+            y, U, self.layout.label, predictor.noise_sd[0], prior=prior, apart=not self.exact
+        )
         if not self.exact:
             self.rates = ep.Rates(model.likelihood, y, self.layout.rows(observations.n_ticks))
             self.reset_ep()
@@ -329,6 +332,10 @@ class Density:
     def given(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
         """Return the distribution of the linear predictors and the prior at each theta."""
         self.evaluated(len(theta["inverse_gain"]))
+        return self._at(theta)
+
+    def _at(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
+        """See `given`."""
         predictor = self.model.linear_predictor(theta, self.observations, self.layout)
         return predictor, self.prior(theta)
 
@@ -336,9 +343,9 @@ class Density:
         """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured.
 
         Here, the noise of a measured rate enters: its sd is `delta_v`, to which `TrustModel.theta`
-        adds the resolution of the rate.
+        adds the resolution of the rate, times `TrustModel.noise_scale`.
         """
-        return self.blocks.seen / predictor.noise_sd**2
+        return self.blocks.seen / each(predictor.noise_sd, self.blocks.first) ** 2
 
     def _joint(self, theta: Theta) -> ep.Joint:
         """Return the blocks, linear predictors, prior and observations for EP at each theta."""

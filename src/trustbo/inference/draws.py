@@ -173,7 +173,7 @@ def read_params(
     return [
         assemble_params(values, **others, **places).in_order(*names)
         for values, places in with_effects(
-            posterior, model.effects, theta, parameters, names[0], next_mission
+            posterior, model.effects, theta, parameters, workspace, next_mission
         )
     ]
 
@@ -183,7 +183,7 @@ def with_effects(
     effects: Sequence[Effect],
     theta: Theta,
     parameters: Mapping[str, np.ndarray],
-    names: Sequence[str],
+    workspace: Workspace | None,
     next_mission: Sequence[bool],
 ) -> list[tuple[dict[str, np.ndarray], dict[str, Any]]]:
     """Return parameters with the effects of robots in the next mission, and those of places.
@@ -193,7 +193,7 @@ def with_effects(
         effects: Effects of its model.
         theta: Hyperparameters (draw, ...) of the effects by name.
         parameters: Parameters (draw, ...) by name, which include the hyperparameters.
-        names: Names of the robots of the result.
+        workspace: Workspace, whose robots are those of the result; None for those of the posterior.
         next_mission: For each result, whether the effects of the next mission are drawn at random,
             and effects of robots in bounds are included. Otherwise, expected effects are used.
 
@@ -202,7 +202,8 @@ def with_effects(
     """
     places = posterior["places"].to_dataset() if "places" in posterior.children else None
     values = {effect: values_of(posterior, effect) for effect in _effects_of_robots(effects)}
-    ahead = _Ahead(theta, parameters, names, names_in(posterior, "feature"))
+    robots = names_in(posterior, "robot") if workspace is None else workspace.team.names
+    ahead = _Ahead(theta, parameters, robots, names_in(posterior, "feature"), workspace)
     return ahead.with_effects(places, values, posterior.attrs["n_missions"], next_mission)
 
 
@@ -218,6 +219,7 @@ class _Ahead(NamedTuple):
     parameters: Mapping[str, np.ndarray]
     robots: Sequence[str]
     features: Sequence[str]
+    workspace: Workspace | None
 
     def with_effects(
         self,
@@ -234,10 +236,11 @@ class _Ahead(NamedTuple):
         maps: dict[str, Any] = {}
         of_robots: dict[str, Any] = {}
         if places is not None:
-            maps |= place_maps_of(places, self.parameters)
+            maps |= place_maps_of(places, self.parameters, self.workspace)
             if any(next_mission):
-                in_bounds = robots_in_bounds_of(places, self.parameters, self.robots)
-                of_robots["place_robot"] = in_bounds
+                of_robots["place_robot"] = robots_in_bounds_of(
+                    places, self.parameters, self.robots, self.workspace
+                )
 
         found = []
         for is_drawn in next_mission:
@@ -560,11 +563,12 @@ def sample_prior_ahead(model: TrustModel, workspace: Workspace, n_draws: int, se
     prior = _prior(model, len(workspace.features), workspace.team.n_robots)
     parameters = prior_parameters(prior, n_draws, rng)
     drawn = model.scores(prior.observations).draw(n_draws, rng)
-    parameters |= {name: drawn[name] for effect in model.effects for name in effect.names}
+    parameters |= {name: drawn[name] for name in model.effect_dims}
 
     theta = model.derived(parameters)
     values, places = with_prior_effects_ahead(workspace, model.effects, theta, parameters, seed)
-    return assemble_params(values, **model.x0, memory=model.memory, **places)
+    params = assemble_params(values, **model.x0, memory=model.memory, **places)
+    return params.in_order(workspace.team.names, workspace.features)
 
 
 def with_prior_effects_ahead(
@@ -592,7 +596,7 @@ def with_prior_effects_ahead(
 
     never = {"robot_effect": np.zeros((n_draws, 0, len(robots)))}
     values = dict.fromkeys(_effects_of_robots(effects), never)
-    ahead = _Ahead(theta, parameters, robots, workspace.features)
+    ahead = _Ahead(theta, parameters, robots, workspace.features, workspace)
     [found] = ahead.with_effects(group, values, 0, [True])
     return found
 

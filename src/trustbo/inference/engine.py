@@ -40,6 +40,7 @@ class Blocks(NamedTuple):
     kind: np.ndarray  # (block,), kind of each block; blocks of one kind share factors
     label: np.ndarray  # (kind,), index on the second axis of a `LinearPredictor`
     seen: np.ndarray  # (kind, row)
+    first: np.ndarray  # (kind,), the first block of each kind
     sums: Any  # sparse (entry, kind * pair of inputs), for the precision entries in `at`
     at: np.ndarray  # (entry,), precision entries with products of columns; see `Order`
     of_prior: Sequence[np.ndarray]  # precision entries of each part of the prior; see `Prior`
@@ -47,14 +48,23 @@ class Blocks(NamedTuple):
 
     @classmethod
     def from_rows(
-        cls, y: np.ndarray, U: Any, label: np.ndarray, *, prior: "Prior", apart: bool = False
+        cls,
+        y: np.ndarray,
+        U: Any,
+        label: np.ndarray,
+        noise: np.ndarray,
+        *,
+        prior: "Prior",
+        apart: bool = False,
     ) -> Self:
-        """Group blocks into kinds; a kind has blocks with equal labels and equal missing rows.
+        """Group blocks into kinds; see `kinds_of`.
 
         Args:
             y: Observations (block, row), NaN where not measured.
             U: Design as a sparse matrix (block * input, column).
             label: Index (block,) of each block on the second axis of a `LinearPredictor`.
+            noise: Standard deviations of the rates' own noise at any theta, shape (1 or block, 1 or
+                row).
             prior: Prior at any theta, which shows which columns depend on each other.
             apart: Whether each block is a separate kind, which is needed if sites differ between
                 blocks.
@@ -64,7 +74,7 @@ class Blocks(NamedTuple):
         n_inputs = U.shape[0] // n_blocks
         U = sparse.csr_array(U)
 
-        kind, label_of_kind, seen = kinds_of(y, label, apart=apart)
+        kind, first, seen = kinds_of(y, label, noise, apart=apart)
 
         # Pairs of inputs are unordered: one number stands for both (k, j) and (j, k).
         above = upper(n_inputs)
@@ -100,8 +110,9 @@ class Blocks(NamedTuple):
             y=np.where(np.isnan(y), 0.0, y),
             U=U,
             kind=kind,
-            label=label_of_kind,
+            label=label[first],
             seen=seen,
+            first=first,
             sums=sums,
             at=at,
             of_prior=prior.entries(order),
@@ -319,23 +330,25 @@ def regress(
 
 
 def kinds_of(
-    y: np.ndarray, label: np.ndarray, *, apart: bool = False
+    y: np.ndarray, label: np.ndarray, noise: np.ndarray, *, apart: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Group blocks into kinds, which have equal labels and equal missing rows.
+    """Group blocks into kinds, which have equal labels, equal missing rows and equal noise.
 
     Args:
         y: Observations (block, row), NaN where not measured.
         label: Label (block,) of each block.
+        noise: Standard deviations (1 or block, 1 or row) of the rates' own noise at any theta.
         apart: Whether each block is a separate kind.
 
     Returns:
-        The kind (block,) of each block, and the label (kind,) and seen rows (kind, row) of each
-        kind.
+        The kind (block,) of each block, and the first block (kind,) and seen rows (kind, row) of
+        each kind.
     """
+    seen = ~np.isnan(y)
     number = np.arange(len(y)) if apart else np.zeros(len(y), dtype=int)
-    key = np.column_stack([number, label, ~np.isnan(y)])
-    kinds, kind = np.unique(key, axis=0, return_inverse=True)
-    return kind.ravel(), kinds[:, 1], kinds[:, 2:].astype(bool)
+    key = np.column_stack([number, label, seen, np.where(seen, noise, 0.0)])
+    _, first, kind = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    return kind.ravel(), first, seen[first]
 
 
 def whiten(label: np.ndarray, predictor: LinearPredictor, lam: Any) -> tuple[Any, Any]:

@@ -292,7 +292,7 @@ def draw_predictors(
     C = V - gain @ V
     G = cholesky(0.5 * (C + np.swapaxes(C, 2, 3)) + _JITTER * np.eye(n_rows))
 
-    sd = np.broadcast_to(predictor.noise_sd, (len(predictor.noise_sd), 1, n_rows))
+    sd = np.broadcast_to(predictor.noise_sd, mean.shape)
     f = np.zeros(mean.shape)
     e = np.zeros(mean.shape)
     log_weight = log_sites - 0.5 * (w**2).sum(2)

@@ -276,9 +276,7 @@ class TrustFilter:
         `awareness` has shape (bound, robot, feature).
         """
         bounds = self._bounds(path, len(awareness))
-        u = self.params.inputs(np.swapaxes(awareness, 0, 1), bounds)
-        u = np.broadcast_to(u, (len(u), self._n_robots, len(awareness)))
-        return [self.params.as_inputs(self.space.grouped(u[..., k])) for k in range(len(awareness))]
+        return self.params.along(np.swapaxes(awareness, 0, 1), bounds, self.space)
 
     def _bounds(self, path: Sequence[Cell] | None, n_bounds: int) -> np.ndarray:
         """Return the moves, rows and columns (bound, 3) of a path; moves are -1 if not needed.

@@ -60,13 +60,15 @@ def _log_evidence_and_slopes(density: Density, z: np.ndarray) -> tuple[np.ndarra
 def _arrays(density: Density, z: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the arrays (point, ...) through which the density depends on scores z.
 
-    These are m (point, label, row), T (point, label, row, input), V (point, label, row, row), and
-    the mean and the parts of the prior on the coefficients. The second result is the log density
-    (point,) that does not depend on rates: of the scores, and of the precision of the coefficients.
+    These are m (point, label, row), T (point, label, row, input), V (point, label, row, row), the
+    variances (point, kind, row) of each rate's own noise, which are part of V, and the mean and the
+    parts of the prior on the coefficients. The second result is the log density (point,) that does
+    not depend on rates: of the scores, and of the precision of the coefficients.
     """
     predictor, prior = density.given(density.theta(z))
-    noise = predictor.noise_sd[..., None] ** 2 * np.eye(predictor.mean.shape[-1])
-    arrays = [predictor.mean, predictor.response, predictor.covariance + noise]
+    noise = 1.0 / density.rate_precision(predictor)
+    arrays = [predictor.mean, predictor.response, predictor.covariance]
+    arrays.append(np.where(density.blocks.seen, noise, 0.0))
     log_rest = 0.5 * prior.log_det + density.scores.log_prior(z)
     return [*arrays, prior.mean, *prior.parts], log_rest
 
@@ -130,7 +132,8 @@ def _slopes_of_arrays(density: Density, z: np.ndarray) -> tuple[np.ndarray, list
             (of_V, predictor.covariance),
         )
     ]
-    return fit.log_p, [*of_rates, of_mean, *of_parts]
+    of_noise = np.diagonal(of_V, axis1=2, axis2=3)
+    return fit.log_p, [*of_rates, of_noise, of_mean, *of_parts]
 
 
 def _per_kind(is_kind: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:

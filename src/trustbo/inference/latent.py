@@ -154,9 +154,10 @@ def draw_exactly(
     """Draw trust given Gaussian rates; return trust and log-likelihoods (draw, mission)."""
     predictor = given.predictor
     y = source.layout.rows(source.observations.contact_rate)
-    kind, label, seen = kinds_of(y, source.label)
+    kind, first, seen = kinds_of(y, source.label, predictor.noise_sd[0])
+    label = source.label[first]
     S = each(predictor.trust_cov, label)
-    W, log_sites = whiten(label, predictor, seen / each(predictor.noise_sd, label) ** 2)
+    W, log_sites = whiten(label, predictor, seen / each(predictor.noise_sd, first) ** 2)
     off = np.where(np.isnan(y), 0.0, y) - given.mean
     w = (W[:, kind] @ off[..., None])[..., 0]
 
@@ -189,7 +190,7 @@ def _rates(
     mean = given.mean[index]
     root = each(root_of(predictor.covariance), source.label)
     f = mean + (root @ rng.standard_normal((*mean.shape, 1)))[..., 0]
-    sd = np.broadcast_to(each(predictor.noise_sd, source.label), f.shape)
+    sd = np.broadcast_to(predictor.noise_sd, f.shape)
 
     unstack = source.layout.unstack
     n_ticks = source.observations.n_ticks

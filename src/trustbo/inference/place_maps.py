@@ -18,9 +18,12 @@ from scipy import fft
 from scipy.linalg import cho_factor, cho_solve
 
 from trustbo.arrays import joined_draws
+from trustbo.data import is_line_of_sight
 from trustbo.models.effects.place import matern
 from trustbo.models.robots_in_bounds import RobotsInBounds
+from trustbo.models.sight_scale import scale_at, variation
 from trustbo.models.visited import Visited
+from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVE_NAMES
 
 _STEP = 0.1
@@ -72,12 +75,16 @@ def place_group(
     return xr.Dataset(variables, coords, {"shape": list(places.shape), "seed": seed})
 
 
-def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def place_maps_of(
+    group: xr.Dataset, parameters: Mapping[str, np.ndarray], workspace: Workspace | None
+) -> dict[str, np.ndarray]:
     """Draw the effects of all cells and bounds on the team, given the effects at visited places.
 
     Args:
         group: Posterior group `places`.
         parameters: Hyperparameters (draw,) by name, with chains joined.
+        workspace: Workspace that predicts line of sight; without it, the scale of effects in bounds
+            that were not visited is 1.
 
     Returns:
         Arrays place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The
@@ -96,19 +103,24 @@ def place_maps_of(group: xr.Dataset, parameters: Mapping[str, np.ndarray]) -> di
     rng = np.random.default_rng([seed, 1])
     place_bound = rng.standard_normal((len(place), len(MOVE_NAMES), rows, cols))
     place_bound *= parameters["tau_e"][:, None, None, None]
+    place_bound *= scale_at(_variation(group, workspace), _floor(parameters)[:, None, None, None])
     _centre(place_bound)
     place_bound[:, *_bounds(group)] = joined_draws(group["place_bound"], ["bound"])
     return {"place": place[:, None], "place_bound": place_bound[:, None]}
 
 
 def robots_in_bounds_of(
-    group: xr.Dataset, parameters: Mapping[str, np.ndarray], robots: Sequence[str]
+    group: xr.Dataset,
+    parameters: Mapping[str, np.ndarray],
+    robots: Sequence[str],
+    workspace: Workspace | None,
 ) -> RobotsInBounds:
     """Return the effects of robots in all bounds, given the effects in visited bounds.
 
     Args:
         group: Posterior group `places`.
         parameters: Hyperparameters (draw,) by name, with chains joined.
+        workspace: See `place_maps_of`.
         robots: Names of the robots of the result. If some of them were not in the fitted missions,
             no effect is known.
     """
@@ -123,7 +135,34 @@ def robots_in_bounds_of(
         known = joined_draws(group["place_robot"].sel(robot=list(robots)), ["robot", "bound"])
 
     seed = int(group.attrs["seed"])
-    return RobotsInBounds(known, column, tau_r, np.arange(len(tau_r)), seed)
+    return RobotsInBounds(
+        known=known,
+        column=column,
+        tau_r=tau_r,
+        floor=_floor(parameters),
+        variation=_variation(group, workspace),
+        number=np.arange(len(tau_r)),
+        seed=seed,
+    )
+
+
+def _floor(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the floor (draw,) of the scale of effects in bounds, which is 1 in some models."""
+    return parameters.get("f_e", np.ones(len(parameters["tau_e"])))
+
+
+def _variation(group: xr.Dataset, workspace: Workspace | None) -> np.ndarray:
+    """Return `variation` of the robots' mean line of sight, shape (move, row, col).
+
+    It is 1 where line of sight is not predicted.
+    """
+    rows, cols = (int(n) for n in group.attrs["shape"])
+    sight = [] if workspace is None else [*filter(is_line_of_sight, workspace.features)]
+    if workspace is None or not sight:
+        return np.ones((len(MOVE_NAMES), rows, cols))
+
+    mean = workspace.awareness.sel(feature=sight).mean(("robot", "feature"), skipna=False)
+    return np.nan_to_num(variation(mean.values), nan=1.0)
 
 
 def in_order_of_places(group: xr.Dataset) -> xr.Dataset:

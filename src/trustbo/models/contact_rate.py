@@ -31,11 +31,11 @@ class ContactRate(dist.Distribution):
 
         d_k = beta0 d_{k-1} + drift_k + delta_w w_k,    d_0 ~ N(x0_mean, x0_sd^2)
         x_k = d_k + offset_k
-        y_k = x_k + delta_v v_k + delta_s s_k
+        y_k = x_k + noise_scale_k delta_v v_k + delta_s s_k
 
-    These are equations (3)-(4) of the paper. If beta0, delta_w or delta_v is a matrix, they are
-    (1)-(2). The batch shape is (mission,) and the event shape is (bound, robot). NaN marks rates
-    that were not measured.
+    These are equations (3)-(4) of the paper, in which noise_scale is 1. If beta0, delta_w or
+    delta_v is a matrix, they are (1)-(2). The batch shape is (mission,) and the event shape is
+    (bound, robot). NaN marks rates that were not measured.
 
     To define your own model, pass `tb.fit` or `tb.Campaign` a function with this distribution at
     the site `contact_rate`. `drift` can be any JAX function of the inputs and of sampled variables.
@@ -82,6 +82,7 @@ class ContactRate(dist.Distribution):
         offset: ArrayLike = 0.0,
         delta_s: ArrayLike | None = None,
         n_ticks: ArrayLike | None = None,
+        noise_scale: ArrayLike = 1.0,
         effects: Sequence[SampledEffect] = (),
     ) -> None:
         """Set the inputs of bounds and the parameters.
@@ -107,13 +108,17 @@ class ContactRate(dist.Distribution):
                 perfectly, for example if all are 1. If every measured rate has a tick count,
                 `log_prob` refers to the tick counts, like the log-likelihoods of `fit`; otherwise,
                 it is the log density of the rates.
+            noise_scale: Factor g of each rate's own noise, shape () or that of `drift`, for noise
+                that depends on the bound; see `Priors.f_v`. For planning, it may depend on the same
+                inputs as the drift.
             effects: Effects that are added to the drift, such as `[PlaceEffect().sample(),
                 RobotEffect().sample()]`. `fit` integrates them out, and then draws them. As they
                 belong to several missions, `log_prob` and `sample` are not defined.
 
         Raises:
-            TrustboError: If the drift or a parameter has the wrong shape; or if there are effects,
-                and an offset, or a matrix as beta0 or noise.
+            TrustboError: If the drift or a parameter has the wrong shape; if there are effects,
+                and an offset, or a matrix as beta0 or noise; or if there is a noise_scale, and a
+                matrix as delta_v.
         """
         u = jnp.asarray(drift, float)
         if u.ndim != 3:
@@ -128,7 +133,8 @@ class ContactRate(dist.Distribution):
             )
 
         n_robots = u.shape[2]
-        for name, value in {"offset": offset, "n_ticks": n_ticks}.items():
+        of_bounds = {"offset": offset, "n_ticks": n_ticks, "noise_scale": noise_scale}
+        for name, value in of_bounds.items():
             if value is not None and np.shape(value) not in ((), u.shape):
                 raise TrustboError(
                     f"{name} must have the shape (mission, bound, robot) = {u.shape} of the drift; "
@@ -140,6 +146,12 @@ class ContactRate(dist.Distribution):
 
         matrices = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v}
         values = {name: _checked(name, v, n_robots, True) for name, v in matrices.items()}
+        is_scaled = not (isinstance(noise_scale, int | float) and noise_scale == 1)
+        if is_scaled and values["delta_v"].ndim == 2:
+            raise TrustboError(
+                "noise_scale cannot be combined with a matrix as delta_v, because robots share "
+                "this noise; leave one out."
+            )
         x0 = {"x0_mean": x0_mean, "x0_sd": x0_sd}
         x0 = {name: _checked(name, v, n_robots, False)[None] for name, v in x0.items()}
 
@@ -153,7 +165,7 @@ class ContactRate(dist.Distribution):
                 delta_s=shared,
                 n_members=1 if shared is None else n_robots,
             )
-        self._set(space, Inputs(u, offset), n_ticks)
+        self._set(space, Inputs(u, offset, noise_scale), n_ticks)
         self.adds_resolution = n_ticks is not None
         self.noises = delta_w, delta_v
         if effects:
@@ -179,11 +191,11 @@ class ContactRate(dist.Distribution):
 
     def _set(self, space: StateSpace, inputs: Inputs, n_ticks: ArrayLike | None) -> None:
         """Set the parameters, and the inputs (mission, bound, group, member)."""
-        drift, offset = jnp.broadcast_arrays(*(jnp.asarray(value, float) for value in inputs))
-        shape = drift.shape
+        given = jnp.broadcast_arrays(*(jnp.asarray(value, float) for value in inputs))
+        shape = given[0].shape
         grouped = *shape[:2], shape[2] // space.n_members, space.n_members
 
-        self.inputs = Inputs(drift.reshape(grouped), offset.reshape(grouped))
+        self.inputs = Inputs(*(value.reshape(grouped) for value in given))
         self.n_ticks = None if n_ticks is None else jnp.broadcast_to(jnp.asarray(n_ticks), shape)
         self.space = space
         self.adds_resolution = False
@@ -209,8 +221,8 @@ class ContactRate(dist.Distribution):
 
     def given(self, effects: ArrayLike) -> "ContactRate":
         """Return the distribution given the effects on the drift (mission, bound, robot)."""
-        drift, offset = self.inputs
-        inputs = Inputs(drift + jnp.reshape(jnp.asarray(effects), drift.shape), offset)
+        drift = self.inputs.drift
+        inputs = self.inputs._replace(drift=drift + jnp.reshape(jnp.asarray(effects), drift.shape))
         flat = Inputs(*(value.reshape(*value.shape[:2], -1) for value in inputs))
         return ContactRate.from_space(self.form, flat, self.n_ticks)
 
@@ -238,8 +250,7 @@ class ContactRate(dist.Distribution):
         robot) of the drift.
         """
         self._require_no_effects("density")
-        drift, offset = self.inputs
-        n_missions, n_bounds, n_groups, n_members = drift.shape
+        n_missions, n_bounds, n_groups, n_members = self.inputs.drift.shape
         shape = n_missions, n_bounds, n_groups * n_members
         if jnp.shape(value) != shape:
             raise TrustboError(
@@ -247,14 +258,14 @@ class ContactRate(dist.Distribution):
                 f"{shape}; got {jnp.shape(value)}."
             )
 
-        rates = jnp.reshape(value, drift.shape)
-        by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in (rates, drift, offset))
+        rates = jnp.reshape(value, self.inputs.drift.shape)
+        by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in (rates, *self.inputs))
 
         space = self.form
 
         def step(belief: kalman.Belief, bound: Any) -> tuple[kalman.Belief, Array]:
-            y, u, o = bound
-            predicted = kalman.predict(space, belief, Inputs(u, o))
+            y, *inputs = bound
+            predicted = kalman.predict(space, belief, Inputs(*inputs))
             no_ticks = y  # any array of this shape
             return kalman.update(space, predicted, y, no_ticks, kalman.GaussianRates())
 
@@ -274,23 +285,22 @@ class ContactRate(dist.Distribution):
         """
         self._require_no_effects("draws")
         space = self.form
-        drift, offset = self.inputs
-        shape = *sample_shape, *drift.shape
+        shape = *sample_shape, *self.inputs.drift.shape
         w, v, s, e = (random.normal(k, shape) for k in random.split(key, 4))
 
         def step(d: Array, bound: Any) -> tuple[Array, Array]:  # equations (1) and (2)
-            u, o, process, shared, own = bound
+            u, o, g, process, shared, own = bound
             d = kalman.step(space.transition, d, u) + apply(root(space.process_cov), process)
             f = d + o
             if space.shared_cov is not None:
                 f = f + apply(root(space.shared_cov), shared)
-            return d, f + space.noise_sd * own
+            return d, f + g * space.noise_sd * own
 
         def by_bound(values: Array) -> Array:
             return jnp.moveaxis(values, -3, 0)
 
         d = space.initial_mean + apply(root(space.initial_cov), e[..., 0, :, :])
-        bounds = tuple(by_bound(values) for values in (drift, offset, w, s, v))
+        bounds = tuple(by_bound(values) for values in (*self.inputs, w, s, v))
         _, rates = lax.scan(step, jnp.broadcast_to(d, e[..., 0, :, :].shape), bounds)
 
         drawn = jnp.moveaxis(rates, 0, -3)

@@ -8,9 +8,11 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from trustbo.arrays import Names
+from trustbo.data import is_line_of_sight
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.models.robots_in_bounds import RobotsInBounds
+from trustbo.models.sight_scale import scale_at, variation
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.statespace.form import coupled_robots, independent_robots
 
@@ -27,7 +29,7 @@ _AXES = {
     **PLACES,
 }
 """Last axes of the parameters, of which those that all robots share lack the first one."""
-_OF_INPUTS = ("beta", "B", "b", *PLACES)
+_OF_INPUTS = ("beta", "B", "b", "f_v", *PLACES)
 """Parameters that are not part of the equation."""
 _MOST_SHOWN = 6
 """Largest number of values that a summary shows; longer parameters are shown as a range."""
@@ -51,6 +53,10 @@ class OwnDrift(Protocol):
 
     def inputs(self, awareness: np.ndarray, bounds: np.ndarray | None = None) -> np.ndarray:
         """See `Draws.inputs`."""
+        ...
+
+    def noise_scale(self, awareness: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+        """Return the factor (draw, robot, bound) of the noise of rates in `bounds` (bound, 3)."""
         ...
 
     def draw(self, index: np.ndarray) -> Self:
@@ -285,9 +291,44 @@ class Draws(Summary):
             awareness = awareness.mean(0, keepdims=True)
         return self.inputs(awareness, bounds).mean(1, keepdims=True)
 
-    def as_inputs(self, u: Any) -> Inputs:
-        """Return inputs as a drift if they are carried over, otherwise as an offset."""
-        return Inputs(u) if self.carried else Inputs(drift=0.0, offset=u)
+    def along(self, awareness: np.ndarray, bounds: np.ndarray, space: StateSpace) -> list[Inputs]:
+        """Return the inputs (draw, group, member) of each bound of a path.
+
+        Args:
+            awareness: Awareness of the bounds, shape (robot, bound, feature).
+            bounds: See `inputs`.
+            space: Equation of the draws; see `state_space`.
+        """
+        u = self.inputs(awareness, bounds)
+        shape = len(u), *awareness.shape[:2]
+        u = np.broadcast_to(u, shape)
+        noise = np.broadcast_to(self.noise_scale(awareness, bounds), shape)
+
+        found = []
+        for k in range(shape[2]):
+            of_bound = space.grouped(u[..., k])
+            drift, offset = (of_bound, 0.0) if self.carried else (0.0, of_bound)
+            found.append(Inputs(drift, offset, space.grouped(noise[..., k])))
+        return found
+
+    def noise_scale(self, awareness: np.ndarray, bounds: np.ndarray) -> Any:
+        """Return the factor (draw, robot or 1, bound) of the noise of rates in some bounds, or 1.
+
+        The arguments are those of `along`.
+        """
+        if self.own is not None:
+            return self.own.noise_scale(awareness, bounds)
+        if "f_v" not in self.arrays:
+            return 1.0
+
+        sight = [m for m, name in enumerate(self.features or ()) if is_line_of_sight(name)]
+        if not sight:
+            raise TrustboError(
+                "f_v needs the names of the features, of which one is line_of_sight; got "
+                f"features={self.features}."
+            )
+        of_team = awareness[..., sight].mean((0, -1))
+        return scale_at(variation(of_team), self.arrays["f_v"][:, None, None])
 
     def draw(self, index: Any) -> Self:
         """Select draws by number, by a list of numbers or by a slice."""

@@ -22,6 +22,7 @@ from trustbo.models.families import FAMILIES, Family
 from trustbo.models.observations import Observations, require_ticks
 from trustbo.models.priors import Priors, as_text
 from trustbo.models.scores import NormalScores
+from trustbo.models.sight_scale import scale_at, variation
 from trustbo.stacking import require_same_team
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.statespace.blocks import Layout, LinearPredictor
@@ -37,6 +38,8 @@ _PRIOR_OF = {
     "partial_v": "concentration",
 }
 """Fields of `Priors` whose hyperparameters have other names."""
+ROUNDING_SD = 12.0**-0.5
+"""Standard deviation of the error of rounding to multiples of 1."""
 _JITTER = 1e-13  # added to the covariance of trust, which rounding could make singular
 
 
@@ -126,6 +129,11 @@ class TrustModel(Summary, ABC):
         """Whether robots depend on each other only through equal, shared noise."""
         return False
 
+    @property
+    def scales_noise(self) -> bool:
+        """Whether the noise depends on the predicted line of sight; see `Priors.f_v`."""
+        return False
+
     def carried(self, observations: Observations) -> bool | np.ndarray:
         """Return which inputs are carried over to later bounds (see `statespace`).
 
@@ -157,7 +165,16 @@ class TrustModel(Summary, ABC):
     ) -> LinearPredictor:
         """Compute trust at all bounds from the state-space form, in NumPy or JAX."""
         space = self.state_space(theta, observations.n_robots)
-        return LinearPredictor.from_space(space, layout, self.random_effects(theta, observations))
+        noise = self.noise_scale(theta, observations)
+        random = self.random_effects(theta, observations)
+        return LinearPredictor.from_space(space, layout, random, noise)
+
+    def noise_scale(self, theta: Theta, observations: Observations) -> Any:
+        """Return the factor (point, mission, bound, 1) of the noise of rates, or 1."""
+        if not self.scales_noise:
+            return 1.0
+        sight = observations.line_of_sight.mean(-1, keepdims=True)
+        return scale_at(variation(sight), theta["f_v"][:, None, None, None])
 
     @property
     def terms(self) -> tuple[Effect, ...]:
@@ -167,7 +184,7 @@ class TrustModel(Summary, ABC):
     @property
     def effect_dims(self) -> dict[str, tuple[str, ...]]:
         """Axes of the effects' hyperparameters by name; all are scalars."""
-        return {name: () for effect in self.effects for name in effect.names}
+        return {name: () for effect in self.effects for name in effect.hyperpriors()}
 
     @property
     def likelihood(self) -> Family:
@@ -194,21 +211,38 @@ class TrustModel(Summary, ABC):
 
         Noise with standard deviation `resolution` is added to `delta_v` in quadrature. Without this
         noise, the density of rates that can be fitted perfectly, such as constant rates, would be
-        unbounded.
+        unbounded. For the same reason, the floor `f_v` is raised such that the noise is nowhere
+        less than the error of rounding to whole ticks.
         """
         if self.likelihood.adds_noise:
             noise = values["delta_v"]
             noise = namespace(noise).hypot(noise, resolution)
             values = {**values, "delta_v": noise}
+        if self.scales_noise:
+            least = (ROUNDING_SD * resolution / values["delta_v"]) ** 2
+            values = {**values, "f_v": scale_at(least, values["f_v"])}
         return self.derived(values)
 
-    def noise_without(self, delta_v: np.ndarray, resolution: float) -> np.ndarray:
-        """Return `delta_v` without the noise that `theta` added, as the prior applies to it."""
-        if not self.likelihood.adds_noise:
-            return delta_v
+    def noise_without(
+        self, values: Mapping[str, np.ndarray], resolution: float
+    ) -> dict[str, np.ndarray]:
+        """Return noises without what `theta` added, as their priors apply to them.
 
-        # Rounding can make the difference of the squares slightly negative.
-        return np.sqrt(np.maximum((delta_v - resolution) * (delta_v + resolution), 0.0))
+        `values` are parameters (draw, ...) by name. The result contains `delta_v` and, if the model
+        has it, `f_v`.
+        """
+        delta_v = values["delta_v"]
+        if not self.likelihood.adds_noise:
+            return {"delta_v": delta_v}
+
+        # Rounding can make the differences of the squares slightly negative.
+        own = np.sqrt(np.maximum((delta_v - resolution) * (delta_v + resolution), 0.0))
+        if "f_v" not in values:
+            return {"delta_v": own}
+
+        least = (ROUNDING_SD * resolution / delta_v) ** 2
+        square = (values["f_v"] ** 2 - least) / (1.0 - least)
+        return {"delta_v": own, "f_v": np.sqrt(np.maximum(square, 0.0))}
 
     def prior_terms(
         self, parameters: Mapping[str, np.ndarray]
@@ -244,7 +278,11 @@ class TrustModel(Summary, ABC):
             priors = Priors.from_features(tuple(features), self.family)
 
         priors = priors.in_order_of(features)
-        return self if priors is self.priors else replace(self, priors=priors)
+        of_rates = self.likelihood.adds_noise
+        effects = [e.for_features(features, of_rates=of_rates) for e in self.effects]
+        if priors is self.priors and effects == list(self.effects):
+            return self
+        return replace(self, priors=priors, effects=effects)
 
     def program(self, observations: Observations) -> None:
         """Run the model as a NumPyro program, for a kernel such as `NUTS(model.program)`.
@@ -254,7 +292,7 @@ class TrustModel(Summary, ABC):
         priors depend on the features.
         """
         of_features = self.for_features(observations.features)
-        if of_features.priors is not self.priors:
+        if of_features is not self:
             return of_features.program(observations)
 
         values = {
@@ -271,9 +309,11 @@ class TrustModel(Summary, ABC):
         if self.likelihood.gaussian:
             carried = np.broadcast_to(self.carried(observations), U.shape[1:])
             dense = U.toarray()
+            shape = observations.contact_rate.shape
             inputs = Inputs(
-                drift=((dense * carried) @ c).reshape(observations.contact_rate.shape),
-                offset=((dense * ~carried) @ c).reshape(observations.contact_rate.shape),
+                drift=((dense * carried) @ c).reshape(shape),
+                offset=((dense * ~carried) @ c).reshape(shape),
+                noise=jnp.broadcast_to(self.noise_scale(theta, observations), (1, *shape))[0],
             )
             space = self.state_space(theta, observations.n_robots)
             rates = ContactRate.from_space(space, inputs, observations.n_ticks)

@@ -92,6 +92,9 @@ class TrustParams(LinearParams):
         robots: Names of the robots, or None. Parameters of a posterior have the names of the fit,
             and planners, filters and simulators put them in the order of their workspace.
         features: Names of the features, or None.
+        f_v: Floor of the scale of the observation noise (see `Priors.f_v`), or None for noise that
+            is the same in all bounds. Predictions of rates then need names of features, of which
+            one is line of sight.
 
     Raises:
         TrustboError: If a value is not a number, is infinite or exceeds 1e12, or if sizes or names
@@ -121,6 +124,7 @@ class TrustParams(LinearParams):
         place_robot: RobotsInBounds | None = None,
         robots: Sequence[str] | None = None,
         features: Sequence[str] | None = None,
+        f_v: Numbers | None = None,
     ) -> None:
         values = {
             "beta0": beta0,
@@ -133,6 +137,7 @@ class TrustParams(LinearParams):
             "place": place,
             "place_bound": place_bound,
             "delta_s": delta_s,
+            "f_v": f_v,
         }
         self._set(values, place_robot, robots, features, memory)
 
@@ -227,7 +232,7 @@ def assemble_params(parameters: Mapping[str, np.ndarray], **others: Any) -> Para
 
     names = ("beta0", "beta", "b", "delta_w", "delta_v")
     values: dict[str, Any] = {name: parameters[name] for name in names}
-    values["delta_s"] = parameters.get("delta_s")
+    values |= {name: parameters.get(name) for name in ("delta_s", "f_v")}
     n_robots = parameters["b"].shape[1:]
     if not n_robots:
         return TrustParams(**values, **others)

@@ -23,9 +23,11 @@ class PooledTrust(TrustModel):
     The trust x_k in a robot and its contact rate y_k in bound k are ::
 
         x_k = beta0 x_{k-1} + beta . z_k + b + delta_w w_k
-        y_k = x_k + delta_v v_k
+        y_k = x_k + g_k delta_v v_k
 
-    with the awareness z_k and independent standard normal w_k and v_k.
+    with the awareness z_k and independent standard normal w_k and v_k. In the paper, g_k is 1. By
+    default, it depends on the predicted line of sight, if there is such a feature; see
+    `Priors.f_v`.
 
     Attributes:
         memory: Quantity carried over between bounds: `"level"` for trust, as in the paper, or
@@ -56,6 +58,8 @@ class PooledTrust(TrustModel):
     def hyperpriors(self, n_robots: int, n_features: int) -> dict[str, Distribution]:
         """See `TrustModel.hyperpriors`."""
         names = ["beta0", "delta_w", "delta_v"]
+        if self.scales_noise:
+            names.append("f_v")
         if self.shared_noise:
             names.append("delta_s")
         return {name: getattr(self.priors, name) for name in names}
@@ -68,6 +72,11 @@ class PooledTrust(TrustModel):
         else:
             inverse_gain = 0.0 * beta0 + 1.0  # ones, in NumPy or JAX
         return {**values, "inverse_gain": inverse_gain}
+
+    @property
+    def scales_noise(self) -> bool:
+        """See `TrustModel.scales_noise`."""
+        return self.priors.f_v is not None and self.likelihood.gaussian and not self.shared_noise
 
     @property
     def joint(self) -> bool:
@@ -98,7 +107,7 @@ class PooledTrust(TrustModel):
     @property
     def dims(self) -> dict[str, tuple[str, ...]]:
         """See `TrustModel.dims`."""
-        axes = {"beta0": (), "beta": ("feature",), "b": (), "delta_w": (), "delta_v": ()}
+        axes = {"beta0": (), "beta": ("feature",), "b": (), "delta_w": (), "delta_v": (), "f_v": ()}
         if self.shared_noise:
             axes["delta_s"] = ()
         return axes

@@ -31,6 +31,8 @@ from trustbo.models.scores import log_density
 _SIGHT_SD = 0.3
 _FEATURE_SD = 0.25
 _INTERCEPT_SD = 0.15
+_FLOOR = (1.0, 2.0)
+"""Parameters of the Beta prior on the floor of the scale of noise."""
 _MIDDLE = 0.5
 """Contact rate that `Priors.for_cells` expects in every cell, the middle of [0, 1]."""
 
@@ -57,6 +59,10 @@ class Priors(Summary):
         delta_w: Standard deviation of the process noise.
         delta_v: Standard deviation of the observation noise, excluding the noise that is due to the
             resolution of the rates. In the beta-binomial family, the concentration is delta_v^-2.
+        f_v: Floor of the scale of the observation noise, in (0, 1). Where the mean over robots of
+            the predicted line of sight is m, the noise has the standard deviation g delta_v with
+            g^2 = f_v^2 + (1 - f_v^2) 4 m (1 - m). None for a floor of 1, with which noise is the
+            same in all bounds. It applies to Gaussian rates in models without shared noise.
         delta_s: Standard deviation of the noise that all robots share in a bound.
         coupling: Off-diagonal entries of B0 and B_m, through which robots influence each other.
         tau: Standard deviation of coefficients between robots in the hierarchical model.
@@ -85,6 +91,7 @@ class Priors(Summary):
     b: Distribution = field(default_factory=partial(_built, dist.Normal, 0.0, 0.5))
     delta_w: Distribution = field(default_factory=partial(_built, dist.HalfNormal, 0.2))
     delta_v: Distribution = field(default_factory=partial(_built, dist.HalfNormal, 0.2))
+    f_v: Distribution | None = None
     delta_s: Distribution = field(default_factory=partial(_built, dist.HalfNormal, 0.2))
     coupling: Distribution = field(default_factory=partial(_built, dist.Normal, 0.0, 0.1))
     tau: Distribution = field(default_factory=partial(_built, dist.HalfNormal, 0.3))
@@ -99,7 +106,8 @@ class Priors(Summary):
         return list(self.describe().items())
 
     def __post_init__(self) -> None:
-        for name in (one.name for one in fields(self) if one.type is Distribution):
+        given = (one.name for one in fields(self) if one.type is Distribution)
+        for name in (*given, *(["f_v"] if self.f_v is not None else [])):
             prior = getattr(self, name)
             if wanted := _wanted(name, prior):
                 raise TrustboError(
@@ -153,7 +161,8 @@ class Priors(Summary):
         slope 1 in this feature, or in the mean of n such features (`line_of_sight_1`, ...). Divided
         by 1 - beta0, the weights of these features have the prior N(1 / n, 0.3^2 / n), other
         weights have N(0, 0.25^2), and the intercept has N(0, 0.15^2). Most rates drawn from these
-        priors are in [0, 1]. For tick counts, the priors are scaled by 5, and a line of sight of
+        priors are in [0, 1]. The floor of the noise has the prior f_v ~ Beta(1, 2) for Gaussian
+        rates. For tick counts, the priors are scaled by 5, and a line of sight of
         0.5 predicts a rate of 0.5. If there is no such feature, the priors are those of `default`.
         """
         features = require_order("features", features)
@@ -173,6 +182,7 @@ class Priors(Summary):
                 default,
                 beta=dist.Normal(slope * is_sight / n, slope * sd),
                 b=dist.Normal(-slope * zero, slope * _INTERCEPT_SD),
+                f_v=_built(dist.Beta, *_FLOOR) if FAMILIES[family].gaussian else None,
                 stationary=True,
                 features=features,
             )
@@ -282,7 +292,7 @@ def _wanted(name: str, prior: Any) -> str:
             f"Normal, because the model integrates {name} out (for other priors, write a NumPyro "
             f"model; {see('howto/your-own-model')})"
         )
-    elif name == "beta0":
+    elif name in ("beta0", "f_v"):
         low, high = (getattr(prior.support, f"{end}_bound", np.nan) for end in ("lower", "upper"))
         good = bool(np.all(low >= 0.0) and np.all(high <= 1.0))
         wanted = "on (0, 1), e.g. Beta(2.0, 2.0)"

@@ -5,6 +5,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.special import ndtri
 
+from trustbo.models.sight_scale import scale_at
+
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _MIX = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
 _ONE = 2.0**-53  # spacing of the uniform numbers
@@ -14,15 +16,18 @@ class RobotsInBounds(NamedTuple):
     """Effects r of robots in the directed bounds of a map, which sum to 0 over robots.
 
     In visited bounds, the effects are posterior draws. In all other bounds, they are independent
-    draws from the prior, tau_r (n_i - mean n) with standard normal n_i for robot i. An array of the
-    draws in all bounds would be larger than all other parameters together, by a factor equal to the
-    number of robots. Therefore, n_i is computed from the numbers of the draw, the robot and the
-    bound when it is needed.
+    draws from the prior, g tau_r (n_i - mean n) with standard normal n_i for robot i and the scale
+    g of `PlaceEffect`. An array of the draws in all bounds would be larger than all other
+    parameters together, by a factor equal to the number of robots. Therefore, n_i is computed from
+    the numbers of the draw, the robot and the bound when it is needed.
 
     Attributes:
         known: Effects in visited bounds, shape (draw, robot, visited).
         column: Index of the visited bound in `known`, shape (move, row, col); -1 elsewhere.
-        tau_r: Standard deviation, shape (draw,).
+        tau_r: Standard deviation at the scale 1, shape (draw,).
+        floor: Floor of the scale, shape (draw,).
+        variation: `sight_scale.variation` of the mean line of sight in each bound, shape (move,
+            row, col).
         number: Number of each draw, shape (draw,), which does not change when draws are selected.
         seed: Random seed.
     """
@@ -30,6 +35,8 @@ class RobotsInBounds(NamedTuple):
     known: np.ndarray
     column: np.ndarray
     tau_r: np.ndarray
+    floor: np.ndarray
+    variation: np.ndarray
     number: np.ndarray
     seed: int
 
@@ -54,7 +61,8 @@ class RobotsInBounds(NamedTuple):
         robot = np.arange(n_robots)[:, None] * self.column.size
         draw = self.number[:, None, None] * n_robots * self.column.size
         n = _standard_normal(draw + robot + bound, self.seed)
-        return self.tau_r[:, None, None] * (n - n.mean(-2, keepdims=True))
+        g = scale_at(self.variation.ravel()[bound], self.floor[:, None, None])
+        return g * self.tau_r[:, None, None] * (n - n.mean(-2, keepdims=True))
 
     def everywhere(self) -> np.ndarray:
         """Return the effects (draw, robot, move, row, col) in all bounds."""
@@ -65,13 +73,18 @@ class RobotsInBounds(NamedTuple):
     def draw(self, index: np.ndarray) -> Self:
         """Select draws by an index array."""
         return self._replace(
-            known=self.known[index], tau_r=self.tau_r[index], number=self.number[index]
+            known=self.known[index],
+            tau_r=self.tau_r[index],
+            floor=self.floor[index],
+            number=self.number[index],
         )
 
     def mean(self) -> Self:
         """Average over draws; effects are 0 in bounds that were not visited."""
         known = self.known.mean(0, keepdims=True)
-        return self._replace(known=known, tau_r=np.zeros(1), number=np.zeros(1, int))
+        return self._replace(
+            known=known, tau_r=np.zeros(1), floor=np.ones(1), number=np.zeros(1, int)
+        )
 
 
 def _standard_normal(counter: np.ndarray, seed: int) -> np.ndarray:

@@ -99,9 +99,7 @@ class ModelSimulator(DescribedSimulator):
 
         params = self.params
         space = params.state_space(n_robots, adds_noise=self.model.likelihood.adds_noise)
-        u = params.inputs(z, bounds_along(cells))
-        u = np.broadcast_to(u, (1, n_robots, n_bounds))
-        inputs = [params.as_inputs(space.grouped(u[..., k])) for k in range(n_bounds)]
+        inputs = params.along(z, bounds_along(cells), space)
 
         offset = params.initial_offset[:, None, None]
         start = kalman.initial(space, n_robots // space.n_members, offset)

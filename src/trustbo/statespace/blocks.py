@@ -133,12 +133,14 @@ class LinearPredictor(NamedTuple):
     trust_cov: Any
     """S, shape (point, label, row, row)."""
     noise_sd: Any
-    """Standard deviation of each rate's own noise, shape (point, 1, 1 or row)."""
+    """Standard deviation of each rate's own noise, shape (point, 1 or block, 1 or row)."""
     shared_cov: Any = None
     """Covariance of shared noise, shape (point, label, row, row), or None."""
 
     @classmethod
-    def from_space(cls, space: StateSpace, layout: Layout, random: Inputs | None = None) -> Self:
+    def from_space(
+        cls, space: StateSpace, layout: Layout, random: Inputs | None = None, noise: Any = 1.0
+    ) -> Self:
         """Compute the distribution of trust at all bounds from the state-space form.
 
         Args:
@@ -146,6 +148,7 @@ class LinearPredictor(NamedTuple):
             layout: Layout of the blocks.
             random: Inputs (point, mission, row, effect) of random effects that differ between
                 missions. The effects are independent and standard normal.
+            noise: Factor (point, mission, bound, robot or 1) of each rate's own noise, or 1.
         """
         n_bounds = layout.shape[1]
         if layout.rotation is not None:
@@ -168,11 +171,15 @@ class LinearPredictor(NamedTuple):
         sd = space.noise_sd
         if sd.shape[-1] > 1:
             sd = xp.tile(sd, (1, 1, n_bounds))
+        if sd.shape[1] > 1:  # each robot has its own noise
+            sd = xp.tile(sd, (1, layout.shape[0], 1))
+        if np.ndim(noise):
+            sd = sd * layout.rows(xp.broadcast_to(noise, (len(noise), *layout.shape)))
 
-        noise = space.shared_cov
-        if noise is not None:
-            noise = repeat_diagonal(noise, n_bounds)
-        return cls(mean, inputs, cov, sd, noise)
+        shared = space.shared_cov
+        if shared is not None:
+            shared = repeat_diagonal(shared, n_bounds)
+        return cls(mean, inputs, cov, sd, shared)
 
     @property
     def covariance(self) -> Any:

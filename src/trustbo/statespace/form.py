@@ -14,20 +14,22 @@ class Inputs(NamedTuple):
     """Input u that is carried over to later bounds."""
     offset: Any = 0.0
     """Input o that affects the trust of one bound only."""
+    noise: Any = 1.0
+    """Factor g of the standard deviation of each rate's own noise."""
 
 
 class StateSpace(NamedTuple):
     """Parameters of a linear Gaussian state-space model of trust.
 
         d_k = A d_{k-1} + u_k + w_k,    w_k ~ N(0, Q),    d_0 ~ N(m0, P0)
-        x_k = d_k + o_k,    f_k = x_k + v_k,    v_k ~ N(0, R),    y_k ~ likelihood(f_k, sd)
+        x_k = d_k + o_k,    f_k = x_k + v_k,    v_k ~ N(0, R),    y_k ~ likelihood(f_k, g_k sd)
 
     Robots are divided into groups that are independent of each other. The members of a group
     influence each other or share noise. A model without such dependence has groups of one robot.
     The axis `group` has length 1 if all groups have equal parameters. The leading axis `point` runs
     over values of the hyperparameters, for example over draws.
 
-    `u` and `o` are not fields, because they depend on data; see `Inputs`.
+    `u`, `o` and `g` are not fields, because they depend on data; see `Inputs`.
     """
 
     transition: Any

@@ -40,6 +40,7 @@ class Belief(NamedTuple):
     mean: Any  # (point, group, member)
     cov: Any  # (point, group, member, member)
     offset: Any  # o of the last bound, (point, group, member)
+    noise: Any  # g of the last bound, (point, group, member)
 
 
 def initial(space: StateSpace, n_groups: int, offset: Any = 0.0) -> Belief:
@@ -55,7 +56,8 @@ def initial(space: StateSpace, n_groups: int, offset: Any = 0.0) -> Belief:
     shape = n_points, n_groups, space.n_members
     mean = xp.broadcast_to(space.initial_mean + offset, shape)
     cov = xp.broadcast_to(space.initial_cov, (*shape, space.n_members))
-    return Belief(mean, cov, xp.broadcast_to(xp.asarray(offset, dtype=mean.dtype), shape))
+    offset = xp.broadcast_to(xp.asarray(offset, dtype=mean.dtype), shape)
+    return Belief(mean, cov, offset, xp.ones(shape))
 
 
 def step(A: Any, state: Any, drift: Any) -> Any:
@@ -75,8 +77,9 @@ def predict(space: StateSpace, belief: Belief, inputs: Inputs) -> Belief:
     state = belief.mean - belief.offset
     mean = step(A, state, inputs.drift) + inputs.offset
     cov = product(product(A, belief.cov), transpose(A)) + space.process_cov
-    offset = namespace(mean).broadcast_to(inputs.offset, mean.shape)
-    return Belief(mean, cov, offset)
+    xp = namespace(mean)
+    offset = xp.broadcast_to(inputs.offset, mean.shape)
+    return Belief(mean, cov, offset, xp.broadcast_to(inputs.noise, mean.shape))
 
 
 def update(
@@ -94,6 +97,7 @@ def update(
     """
     xp = namespace(predicted.mean)
     n = space.n_members
+    sd = space.noise_sd * predicted.noise
     mean = predicted.mean
     cov = predicted.cov
     first = 0
@@ -110,11 +114,12 @@ def update(
             continue
 
         mean, cov, log_mass = condition(
-            mean, cov, first + i, rate, n_ticks[..., i], space.noise_sd[..., i], likelihood
+            mean, cov, first + i, rate, n_ticks[..., i], sd[..., i], likelihood
         )
         log_density = log_density + xp.broadcast_to(log_mass, mean.shape[:-1]).sum(-1)
 
-    return Belief(mean[..., :n], cov[..., :n, :n], predicted.offset), log_density
+    updated = predicted._replace(mean=mean[..., :n], cov=cov[..., :n, :n])
+    return updated, log_density
 
 
 def condition(
@@ -197,7 +202,8 @@ def marginal_log_densities(
         cov = cov + space.shared_cov
 
     var = np.diagonal(cov, axis1=-2, axis2=-1)
-    log_mass = likelihood.moment_match(y, n_ticks, predicted.mean, var, space.noise_sd)[0]
+    sd = space.noise_sd * predicted.noise
+    log_mass = likelihood.moment_match(y, n_ticks, predicted.mean, var, sd)[0]
     return np.where(np.isnan(y), 0.0, log_mass).reshape(len(var), -1)
 
 
@@ -221,7 +227,7 @@ def simulate(
     if space.shared_cov is not None:
         f = f + _noise(np.broadcast_to(space.shared_cov, now.cov.shape), rng)
 
-    rates = likelihood.sample(f, space.noise_sd, n_ticks, rng)
+    rates = likelihood.sample(f, space.noise_sd * now.noise, n_ticks, rng)
     return now, rates.reshape(len(rates), -1)
 
 

@@ -159,8 +159,9 @@ def _require_same_rates(model: FunctionModel, wanted: Probe, found: Probe) -> No
     if not all(a.shape == b.shape and _is_same(a, b) for a, b in fields):
         raise TrustboError(_not_of_robots(model))
 
-    for name in ("drift", "offset"):
-        if not _is_same(getattr(wanted.inputs, name), getattr(found.inputs, name)):
+    names = {"drift": "drift", "offset": "offset", "noise": "noise_scale"}
+    for field, name in names.items():
+        if not _is_same(getattr(wanted.inputs, field), getattr(found.inputs, field)):
             raise TrustboError(
                 f"the {name} of {model.in_short()} changes with the padding of missions and "
                 "bounds; instead of means, sums or numbers of missions and bounds, use constants, "

@@ -80,13 +80,20 @@ class FunctionDrift:
         bounds = of_map if bounds is None else bounds
 
         known = ~np.isnan(z).any((1, 2))
-        found = self._drift(z[known], bounds[known])
+        found = self._of_bounds("drift", z[known], bounds[known])
         drift = np.full((len(found), self.n_robots, len(z)), np.nan)
         drift[..., known] = found
         return drift.reshape(*drift.shape[:2], *shape)
 
-    def _drift(self, z: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-        """Compute the drift (draw, robot, bound); `z` has the shape (bound, robot, feature)."""
+    def noise_scale(self, awareness: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+        """Compute the scale (draw, robot, bound) of the noise; see `ContactRate`."""
+        return self._of_bounds("noise", _bounds_of(awareness)[0], bounds)
+
+    def _of_bounds(self, field: str, z: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+        """Compute a field of `Inputs`, shape (draw, robot, bound).
+
+        `z` has the shape (bound, robot, feature).
+        """
         data = self._data(z, bounds)
         n_draws = len(self.number)
         size = max(1, _NUMBERS // data["awareness"][..., 0].size)
@@ -94,11 +101,11 @@ class FunctionDrift:
         parts = []
         for first in range(0, n_draws, size):
             _, inputs = self._some(slice(first, first + size))._run(data)
-            drift = _by_robot(inputs)[:, 0, : len(z)].swapaxes(1, 2)
-            parts.append(drift.sum(0, keepdims=True) if self.of_mean else drift)
+            part = _by_robot(getattr(inputs, field))[:, 0, : len(z)].swapaxes(1, 2)
+            parts.append(part.sum(0, keepdims=True) if self.of_mean else part)
 
-        drift = np.concatenate(parts)
-        return drift.sum(0, keepdims=True) / n_draws if self.of_mean else drift
+        found = np.concatenate(parts)
+        return found.sum(0, keepdims=True) / n_draws if self.of_mean else found
 
     def _run(self, data: Data, of_missions: Mapping[str, Any] | None = None) -> Any:
         """Run the function; return the form (draw, group, member) and the inputs.
@@ -161,7 +168,7 @@ class FunctionDrift:
         of_missions = some._drawn_for_mission(data)
         first, inputs = some._run(data, of_missions)
         shapes = {name: site.shape for name, site in some.model.sites(data).items()}
-        wanted = _by_robot(inputs)[:, 0, : len(z)]
+        wanted = _drift_and_noise(inputs)[:, 0, : len(z)]
 
         order = np.random.default_rng(0).permutation(len(z))[: max(1, len(z) // 2)]
         data = some._data(z[order], bounds[order])
@@ -179,14 +186,15 @@ class FunctionDrift:
             for name, values in of_missions.items()
         }
         second, inputs = some._run(data, twice)
-        found = _by_robot(inputs).reshape(len(wanted), -1, self.n_robots)[:, : len(order)]
+        found = _drift_and_noise(inputs).reshape(len(wanted), -1, 2 * self.n_robots)
+        found = found[:, : len(order)]
 
         error = np.abs(found - wanted[:, order]).max(initial=0.0)
         if error > _SAME * max(1.0, np.abs(wanted).max(initial=0.0)):
             raise TrustboError(
-                f"{self.model.in_short()} cannot plan: the drift of a bound changes with the order "
-                "or the number of bounds or missions. It may depend only on the awareness, the "
-                "cell and the move of the same bound."
+                f"{self.model.in_short()} cannot plan: the drift or the noise_scale of a bound "
+                "changes with the order or the number of bounds or missions. It may depend only on "
+                "the awareness, the cell and the move of the same bound."
             )
 
         pairs = [(a, b) for a, b in zip(first, second, strict=True) if a is not None]
@@ -286,7 +294,11 @@ def _keys(number: np.ndarray) -> Any:
         return jax.vmap(jax.random.fold_in, (None, 0))(jax.random.key(_SEED), number)
 
 
-def _by_robot(inputs: Inputs) -> np.ndarray:
-    """Return the drift (draw, mission, bound, robot)."""
-    drift = inputs.drift
-    return drift.reshape(*drift.shape[:3], -1)
+def _by_robot(values: np.ndarray) -> np.ndarray:
+    """Return values (draw, mission, bound, robot), without groups of robots."""
+    return values.reshape(*values.shape[:3], -1)
+
+
+def _drift_and_noise(inputs: Inputs) -> np.ndarray:
+    """Return the drift and the scale of the noise along the last axis, 2 for each robot."""
+    return np.concatenate([_by_robot(inputs.drift), _by_robot(inputs.noise)], axis=-1)

@@ -16,7 +16,7 @@ from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, eviden
 from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
-from trustbo.statespace import StateSpace
+from trustbo.statespace import Inputs, StateSpace
 from trustbo.statespace.blocks import Layout, LinearPredictor, each
 from trustbo.workspace import Workspace
 
@@ -57,31 +57,34 @@ class AddedEffects(Columns):
         if of_counts and not np.isnan(of_ticks).any():
             self._log_resolution = float(of_ticks.sum())
 
-    def log_evidence(self, space: StateSpace, drift: np.ndarray, theta: Theta) -> np.ndarray:
+    def log_evidence(self, space: StateSpace, inputs: Inputs, theta: Theta) -> np.ndarray:
         """Compute the log density (point,) of the rates, with the coefficients integrated out.
 
         Args:
             space: Parameters at each point; the axis `group` has one entry, or one of each robot.
-            drift: Drift without effects, shape (point, mission, bound, robot).
+            inputs: Drift without effects and scale of the noise, shape (point, mission, bound,
+                robot). There is no offset.
             theta: Hyperparameters (point, ...) by name.
         """
-        n = len(drift)
+        n = len(inputs.drift)
         log_p = np.full(n, -np.inf)
         fields = [value for value in space if value is not None]
-        flat = [values.reshape(n, -1) for values in (*fields, drift, *theta.values())]
+        flat = [values.reshape(n, -1) for values in (*fields, *inputs, *theta.values())]
         is_possible = np.isfinite(np.concatenate(flat, axis=1)).all(1)
-        is_possible &= (space.noise_sd.reshape(n, -1) > _LEAST_NOISE).all(1)
+        least = space.noise_sd.reshape(n, -1).min(1) * inputs.noise.reshape(n, -1).min(1)
+        is_possible &= least > _LEAST_NOISE
         is_possible &= (theta["inverse_gain"].reshape(n, -1) != 0.0).all(1)
 
         some = np.flatnonzero(is_possible)
         with np.errstate(all="ignore"):  # extreme values overflow and get zero density
             for where, chunk in chunks({name: v[some] for name, v in theta.items()}):
-                fit, _ = self._fit(space.take(some[where]), drift[some[where]], chunk)
+                at = some[where]
+                fit, _ = self._fit(space.take(at), Inputs(*(v[at] for v in inputs)), chunk)
                 log_p[some[where]] = fit.log_p
         return np.where(np.isfinite(log_p), log_p + self._log_resolution, -np.inf)
 
     def draw(
-        self, space: StateSpace, drift: np.ndarray, theta: Theta, rng: np.random.Generator
+        self, space: StateSpace, inputs: Inputs, theta: Theta, rng: np.random.Generator
     ) -> dict[str, dict[str, np.ndarray]]:
         """Draw the variables (draw, ...) of each effect given the rates, by group and name.
 
@@ -89,26 +92,27 @@ class AddedEffects(Columns):
         """
         parts = []
         for where, chunk in chunks(theta):
-            fit, prior = self._fit(space.take(where), drift[where], chunk)
+            fit, prior = self._fit(space.take(where), Inputs(*(v[where] for v in inputs)), chunk)
             mean, deviation, _ = coefficients_of(prior, fit, 1, rng)
             parts.append(mean + deviation[:, 0])
         return self.to_variables(np.concatenate(parts), theta)
 
-    def _fit(self, space: StateSpace, drift: np.ndarray, theta: Theta) -> tuple[Fit, Prior]:
+    def _fit(self, space: StateSpace, inputs: Inputs, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence at each point; also return the prior."""
         rates = self.observations.contact_rate
         prior = self.prior(theta)
         layout, label = layout_of(space, rates)
+        predictor = LinearPredictor.from_space(space, layout, noise=inputs.noise)
         if self._blocks is None:
             U = layout.design(self.U)
-            self._blocks = Blocks.from_rows(layout.rows(rates), U, label, prior=prior)
+            noise = predictor.noise_sd[0]
+            self._blocks = Blocks.from_rows(layout.rows(rates), U, label, noise, prior=prior)
         blocks = self._blocks
-        predictor = LinearPredictor.from_space(space, layout)
 
         # The drift of the function is known, so its mean contribution is taken off the rates.
-        u = layout.rows(drift)
+        u = layout.rows(inputs.drift)
         known = (each(predictor.response, label) @ u[..., None])[..., 0]
-        precision = blocks.seen / each(predictor.noise_sd, blocks.label) ** 2
+        precision = blocks.seen / each(predictor.noise_sd, blocks.first) ** 2
         return evidence(blocks, predictor, prior, precision, blocks.y - known), prior
 
 

@@ -197,9 +197,8 @@ def draws_of_function(
         return [draws_of_drift(drift, resolution)] * len(next_mission)
 
     theta = drift.theta()
-    found = with_effects(
-        posterior, effects, theta, no_weights(theta, features), robots, next_mission
-    )
+    parameters = no_weights(theta, features)
+    found = with_effects(posterior, effects, theta, parameters, workspace, next_mission)
     return [draws_of_drift(drift, resolution, one) for one in found]
 
 

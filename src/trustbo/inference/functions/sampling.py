@@ -23,7 +23,7 @@ from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.nuts import Chains, Samples, Start, Tuning
 from trustbo.inference.options import Options
 from trustbo.models.backend import own_settings
-from trustbo.statespace import StateSpace
+from trustbo.statespace import Inputs, StateSpace
 from trustbo.streams import stream
 
 AUTO, IMPORTANCE, NUTS = SAMPLERS = ("auto", "importance", "nuts")
@@ -95,8 +95,8 @@ class Target:
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, coordinate)."""
         if self.effects is not None:
-            log_p, space, drift, theta = self._given(x)
-            return log_p + self.effects.log_evidence(space, drift, theta)
+            log_p, space, inputs, theta = self._given(x)
+            return log_p + self.effects.log_evidence(space, inputs, theta)
 
         return self._in_batches("log density", self.traced, x)
 
@@ -112,12 +112,10 @@ class Target:
         """Draw the effects of the function, if it has any, at points (draw, coordinate)."""
         if self.effects is None:
             return None
-        _, space, drift, theta = self._given(x)
-        return self.effects.draw(space, drift, theta, rng)
+        _, space, inputs, theta = self._given(x)
+        return self.effects.draw(space, inputs, theta, rng)
 
-    def _given(
-        self, x: np.ndarray
-    ) -> tuple[np.ndarray, StateSpace, np.ndarray, dict[str, np.ndarray]]:
+    def _given(self, x: np.ndarray) -> tuple[np.ndarray, StateSpace, Inputs, dict[str, np.ndarray]]:
         """Return the log density without rates, and the arguments of `AddedEffects`, at points."""
         of_points = self.coordinates
         deviations = of_points.deviations
@@ -129,9 +127,9 @@ class Target:
         found: Outer = self._in_batches("outer", one, x)
         effects: Any = self.effects
         shape = effects.observations.contact_rate.shape
-        drift = found.inputs.drift[:, : shape[0], : shape[1]].reshape(-1, *shape)
+        given = (value[:, : shape[0], : shape[1]].reshape(-1, *shape) for value in found.inputs)
         fields = [None if value is None else value[:, 0] for value in found.space]
-        return found.log_p, StateSpace(*fields), drift, found.theta
+        return found.log_p, StateSpace(*fields), Inputs(*given), found.theta
 
     def points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Convert values (draw, ...) of the variables to coordinates (draw, coordinate)."""

@@ -20,6 +20,7 @@ from trustbo.inference.latent import N_PRIOR, N_TRAJECTORIES, Given, Source, dra
 from trustbo.models.effects.effect import Theta
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
+from trustbo.statespace import Inputs
 from trustbo.statespace.blocks import LinearPredictor
 from trustbo.workspace import Workspace
 
@@ -153,11 +154,11 @@ class OfFunction(Source):
             found: Found = self.known.run("evaluate", at(self._values, index), self._keys[index])
             space = found.space.take(np.s_[:, 0])
             space = space._replace(noise_sd=np.maximum(space.noise_sd, _LEAST_NOISE))
-            predictor = LinearPredictor.from_space(space, self.layout)
-
             shape = len(index), n_missions, n_bounds, n_robots
-            inputs = (value[:, :n_missions, :n_bounds].reshape(shape) for value in found.inputs)
-            drift, offset = (self.layout.rows(values) for values in inputs)
+            given = Inputs(*(v[:, :n_missions, :n_bounds].reshape(shape) for v in found.inputs))
+            predictor = LinearPredictor.from_space(space, self.layout, noise=given.noise)
+            drift = self.layout.rows(given.drift)
+            offset = self.layout.rows(given.offset)
             yield Given(
                 some=index,
                 predictor=predictor,

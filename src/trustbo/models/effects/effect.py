@@ -6,7 +6,7 @@ planning need no change.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -62,7 +62,7 @@ class Effect:
     """
 
     names: ClassVar[tuple[str, ...]] = ()
-    """Names of the hyperparameters."""
+    """Names of the hyperparameters that are always positive numbers."""
     group: ClassVar[str] = ""
     """Plural name of the objects with the effect; also the name of the group in a posterior."""
     variables: ClassVar[Mapping[str, tuple[str, ...]]] = {}
@@ -130,6 +130,10 @@ class Effect:
         """
         values = {name: numpyro.sample(name, prior) for name, prior in self.hyperpriors().items()}
         return SampledEffect(self, values)
+
+    def for_features(self, features: Sequence[str], *, of_rates: bool) -> Self:
+        """Return the effect for these features; `of_rates` is false if trust is a logit."""
+        return self
 
     @property
     def pairs(self) -> list[Pair]:

@@ -1,8 +1,9 @@
 """Place effects: a process s over cells, and effects e of bounds and r of robots in bounds."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpyro.distributions as dist
@@ -10,11 +11,13 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.linalg import helmert, lapack
 
-from trustbo.data import Mission
+from trustbo.data import Mission, is_line_of_sight
 from trustbo.errors import require_positive
+from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
+from trustbo.models.sight_scale import scale_at, variation
 from trustbo.models.visited import bounds_of, maps_of, visited
 from trustbo.statespace.matrices import namespace
 from trustbo.workspace import Workspace
@@ -32,9 +35,17 @@ class PlaceEffect(Effect):
         u_i(a -> c) = beta . z_i(a -> c) + b + s(c) + e(a -> c) + r_i(a -> c)
 
     Here s is a Gaussian process over cells with standard deviation tau_s and a Matern 3/2
-    covariance. The effects e(a -> c) ~ N(0, tau_e^2) of directed bounds are independent. The
+    covariance. The effects e(a -> c) ~ N(0, g^2 tau_e^2) of directed bounds are independent. The
     effects r_i of robots in a bound sum to 0 over the robots: for n robots, they have the
-    covariance tau_r^2 (I - 1/n).
+    covariance g^2 tau_r^2 (I - 1/n).
+
+    The scale g depends on the mean m of the robots' predicted line of sight in the bound, because
+    the map errs less where it predicts no contact or whole contact ::
+
+        g^2 = f_e^2 + (1 - f_e^2) 4 m (1 - m)
+
+    The floor f_e is g where m is 0 or 1. Without a feature that predicts line of sight, and if
+    trust is a logit, f_e is 1, so that all bounds have the same scale.
 
     The errors of awareness differ between robots, and they are the same each time that the robots
     drive a bound. Without r_i, these errors would look like independent noise, and bounds that the
@@ -50,9 +61,11 @@ class PlaceEffect(Effect):
         tau_r: Scale of the half-normal prior on the standard deviation of r.
         length_scale: Median of the log-normal prior on the length scale of s, in cells.
         length_scale_sd: Prior standard deviation of the log length scale.
+        f_e: Number b of the prior Beta(1, b) on the floor f_e, whose mean is 1 / (1 + b). With 0,
+            the floor is 1.
 
     Raises:
-        TrustboError: If a setting is not positive.
+        TrustboError: If a setting is not positive, or `f_e` is negative.
 
     Example:
         >>> model = tb.models.PooledTrust(effects=[tb.models.PlaceEffect(tau_s=0.4)])
@@ -65,6 +78,7 @@ class PlaceEffect(Effect):
     tau_r: float = 0.1
     length_scale: float = 2.0
     length_scale_sd: float = 0.5
+    f_e: float = 2.0
     names = ("tau_s", "length_scale", "tau_e", "tau_r")
     group = "places"
     # The axes are defined in `place_maps.place_group`.
@@ -74,11 +88,22 @@ class PlaceEffect(Effect):
         super().__post_init__()
         sd = require_positive("PlaceEffect.length_scale_sd", self.length_scale_sd)
         object.__setattr__(self, "length_scale_sd", sd)
+        f_e = require_positive("PlaceEffect.f_e", self.f_e, or_zero=True)
+        object.__setattr__(self, "f_e", f_e)
+
+    def for_features(self, features: Sequence[str], *, of_rates: bool) -> Self:
+        """See `Effect.for_features`; the floor is 1 where nothing predicts the rate."""
+        if of_rates and any(is_line_of_sight(name) for name in features):
+            return self
+        return replace(self, f_e=0.0)
 
     def hyperpriors(self) -> dict[str, dist.Distribution]:
         """See `Effect.hyperpriors`."""
         length_scale = dist.LogNormal(np.log(self.length_scale), self.length_scale_sd)
-        return super().hyperpriors() | {"length_scale": length_scale}
+        priors = super().hyperpriors() | {"length_scale": length_scale}
+        if self.f_e > 0.0:
+            priors["f_e"] = _prior_of_floor(self.f_e)
+        return priors
 
     @property
     def pairs(self) -> list[Pair]:
@@ -122,12 +147,11 @@ class PlaceEffect(Effect):
         """Return a Gaussian-process prior on cells and independent priors on bounds."""
         xp: Any = namespace(theta["tau_e"])
         places: Any = observations.visited
-        of_bound = xp.maximum(theta["tau_e"], LEAST) ** -2.0
-        of_bounds = xp.repeat(of_bound[:, None], len(places.bounds), axis=1)
-
-        n_contrasts = len(places.bounds) * (observations.n_robots - 1)
-        of_robot = xp.maximum(theta["tau_r"], LEAST) ** -2.0
-        of_robots = xp.repeat(of_robot[:, None], n_contrasts, axis=1)
+        g = scale_of_bounds(theta, _variation(observations))  # (point or 1, bound)
+        ones = np.ones((len(theta["tau_e"]), len(places.bounds)))
+        of_bounds = ones * xp.maximum(g * theta["tau_e"][:, None], LEAST) ** -2.0
+        of_robot = ones * xp.maximum(g * theta["tau_r"][:, None], LEAST) ** -2.0
+        of_robots = xp.repeat(of_robot, observations.n_robots - 1, axis=1)
 
         of_cells = [self._cells(theta, square) for square in places.squares]
         return None, [*of_cells, of_bounds, of_robots]
@@ -158,6 +182,33 @@ class PlaceEffect(Effect):
         of_robots = values["place_robot"] @ contrasts(observations.n_robots)
         of_robots = of_robots.reshape(len(of_robots), -1)
         return np.column_stack([values["place"], values["place_bound"], of_robots])
+
+
+@cache
+def _prior_of_floor(b: float) -> dist.Distribution:
+    """Return Beta(1, b); it takes JAX some time to make it."""
+    with own_settings():
+        return dist.Beta(1.0, b)
+
+
+def scale_of_bounds(theta: Mapping[str, Any], of_bound: np.ndarray) -> Any:
+    """Return the scale (point, bound), or (1, bound) of ones, of the effects of bounds.
+
+    `of_bound` (bound,) is `variation` of the mean line of sight of the robots in each bound.
+    """
+    if "f_e" not in theta:
+        return np.ones((1, len(of_bound)))
+    return scale_at(of_bound, theta["f_e"][:, None])
+
+
+def _variation(observations: Observations) -> np.ndarray:
+    """Return `variation` of the mean line of sight in each visited bound, shape (bound,)."""
+    places: Any = observations.visited
+    there = places.at >= 0
+    at = places.at[there]
+    sight = observations.line_of_sight.mean(-1)[there]
+    n = len(places.bounds)
+    return variation(np.bincount(at, sight, n) / np.bincount(at, minlength=n))
 
 
 def _inverse(A: Any) -> Any:
