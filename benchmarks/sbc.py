@@ -22,9 +22,8 @@ from scipy import stats
 from tqdm import tqdm
 
 import trustbo as tb
-from trustbo.inference.classes import OfClass
+from trustbo.inference.classes import OfClass, by_importance
 from trustbo.inference.density import Density, JointDraws
-from trustbo.inference.fit import by_importance
 from trustbo.inference.importance import MAX_KHAT
 from trustbo.inference.latent import replicate
 from trustbo.inference.variables import to_variables

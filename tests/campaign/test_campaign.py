@@ -224,7 +224,7 @@ def test_robots_and_features_are_put_in_the_order_of_the_workspace(workspace):
 def test_refused_posterior_leaves_a_mission_told_until_the_next_is_learned(workspace, monkeypatch):
     campaign = begin(workspace)
     with monkeypatch.context() as patch:
-        patch.setattr("trustbo.inference.learner.fit", lambda *args, **kwargs: refuse())
+        patch.setattr("trustbo.campaign.learning.fit", lambda *args, **kwargs: refuse())
         with pytest.warns(UserWarning, match="mission 1"):
             assert campaign.tell(rates(workspace, campaign.ask().path)) is None
     assert states(campaign) == ["told"]
@@ -243,7 +243,7 @@ def test_defect_of_a_fit_costs_no_mission(workspace, monkeypatch):
         raise np.linalg.LinAlgError("Singular matrix")
 
     campaign = begin(workspace)
-    monkeypatch.setattr("trustbo.inference.learner.fit", break_down)
+    monkeypatch.setattr("trustbo.campaign.learning.fit", break_down)
     with pytest.warns(UserWarning, match="LinAlgError"):
         campaign.tell(rates(workspace, campaign.ask().path))
     assert states(campaign) == ["told"]

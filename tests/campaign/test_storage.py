@@ -124,7 +124,7 @@ def test_campaign_that_dies_while_it_learns_learns_when_it_is_loaded(
         simulator = ModelSimulator(workspace, blind=True)
         mission = simulator.run(campaign.ask().path, seed=campaign.state.seed_of("mission"))
         with monkeypatch.context() as patch:
-            patch.setattr("trustbo.inference.learner.fit", die)
+            patch.setattr("trustbo.campaign.learning.fit", die)
             with pytest.raises(Dead):
                 campaign.tell(mission)
     with tb.Campaign.load(tmp_path) as again:

@@ -286,7 +286,7 @@ def test_nuts_and_importance_sampling_agree(missions, model, monkeypatch):
     """Means differ by at most 4 sds of their Monte Carlo errors, about .06 posterior sd."""
     more = {"size": 8192, "enough": 6000.0, "most": 12}
     exact = lambda *args, **options: importance.sample(*args, **options | more)  # noqa: E731
-    monkeypatch.setattr(sys.modules["trustbo.inference.fit"], "sample", exact)
+    monkeypatch.setattr(sys.modules["trustbo.inference.classes"], "sample", exact)
     size, over = {"progress": False, "latent": False, "check": False}, ("chain", "draw")
     found = fit(missions, model, draws=20_000, **size)
     ours, kish = found["posterior"].to_dataset(), found.attrs["kish"]

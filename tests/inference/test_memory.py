@@ -10,8 +10,8 @@ from missions import draw_rates
 from scipy import stats
 
 import trustbo as tb
+from trustbo.inference.classes import by_importance
 from trustbo.inference.density import Density
-from trustbo.inference.fit import by_importance
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect, TrustParams
 
 FEATURES = ["line_of_sight", "slope"]

@@ -164,7 +164,7 @@ class Campaign(Recorder):
         )
 
         state = State(settings, earlier=earlier_missions(earlier, workspace))
-        learner.require_poolable(state.earlier.missions, workspace)
+        learner.require_poolable(state.earlier.missions, workspace.team.names)
         super().__init__(workspace, state, learner, base)
 
         self._progress = progress

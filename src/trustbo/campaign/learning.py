@@ -12,7 +12,9 @@ from trustbo.errors import PosteriorError, TrustboError, warn
 from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard
 from trustbo.inference.diagnostics import diagnostics
+from trustbo.inference.fit import fit
 from trustbo.inference.learner import Learner
+from trustbo.inference.tree import parameters_alone
 from trustbo.planning import Plan
 from trustbo.stacking import pooled
 from trustbo.workspace import Workspace
@@ -122,16 +124,19 @@ def _fitted(
     """
     used = state.used
     earlier = usable(state.earlier.missions)
-    tree = learner.fit(
+    whole = fit(
         [state.entries[j].mission for j in used],
+        learner.known,
         workspace=workspace,
         sampler=state.settings["sampler"],
         seed=state.seed_of_fit,
         progress=progress,
         start=_previous(state),
         earlier=earlier,
+        latent=False,
         **state.settings["fit"],
     )
+    tree = parameters_alone(whole)
     tree.attrs["missions"] = [*range(-len(earlier), 0), *used]
     tree["hazard"] = xr.DataTree(hazard)
 

@@ -1,6 +1,5 @@
 """Fit a model to missions: sample, check the diagnostics, and build a DataTree for ArviZ."""
 
-import json
 import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -9,46 +8,24 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.display import slow_bar
 from trustbo.errors import (
     PosteriorError,
     TrustboError,
     require_choice,
     require_count,
-    require_kind,
     require_whole,
 )
-from trustbo.inference.classes import OfClass
-from trustbo.inference.density import Coefficients, Density, JointDraws
-from trustbo.inference.draws import as_fitted, names_in, stored_draws
-from trustbo.inference.functions.fit import fit_function, require_poolable_with_function
-from trustbo.inference.functions.known import as_model
-from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
-from trustbo.inference.importance import MAX_KHAT, Points, Student, sample
-from trustbo.inference.latent import N_PRIOR
-from trustbo.inference.nuts import sample_by_nuts
+from trustbo.inference.draws import as_fitted, names_in
+from trustbo.inference.learner import as_learner
 from trustbo.inference.options import Options
-from trustbo.inference.tree import Fitted, by_chain, default_draws, to_tree, with_latent
-from trustbo.inference.variables import prior_parameters, to_variables
+from trustbo.inference.tree import to_tree, with_latent
 from trustbo.models.default import default_model
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
-from trustbo.models.record import model_to_record
 from trustbo.models.visited import has_places
 from trustbo.parallel import computing
-from trustbo.stacking import list_of_missions, prepare, require_same_robots
+from trustbo.stacking import list_of_missions, prepare
 from trustbo.workspace import Workspace
-
-SAMPLERS = ("importance", "nuts")
-"""Names of the samplers of `fit`."""
-_NEGLIGIBLE = 0.01
-"""Weight of a point, relative to the mean weight, below which EP is not corrected there."""
-_SIZE = 256
-"""Points per round of the importance sampler."""
-_LAST_SIZE = 1024
-"""Points per round of the last attempt."""
-_MANY_SCORES = 13
-"""Smallest number of scores for which a round has four times as many points."""
 
 
 @computing()
@@ -140,19 +117,12 @@ def fit(
     if all(np.isnan(mission.contact_rate).all() for mission in missions):
         raise TrustboError("every contact rate is NaN; fit needs at least one measured rate.")
 
-    is_class = isinstance(model, TrustModel | type) or not callable(model)
-    samplers = SAMPLERS if is_class else OF_FUNCTIONS
+    learner = as_learner(model)
+    samplers = learner.samplers
     sampler = samplers[0] if sampler is None else require_choice("sampler", sampler, samplers)
+    learner.require_poolable(earlier, robots)
     options = Options(sampler, draws, chains, warmup, seed, progress, check, start)
-    if is_class:
-        remedy = "give a model such as PooledTrust(), or a NumPyro function"
-        of_class: TrustModel = require_kind("model", model, TrustModel, remedy)
-        require_poolable_with_model(of_class, earlier, robots)
-        found = fit_class(missions, of_class, workspace, options)
-    else:
-        function = as_model(model)  # pyright: ignore[reportArgumentType]
-        require_poolable_with_function(function, earlier, robots)
-        found = fit_function(missions, function, workspace, options)
+    found = learner.sampled(missions, workspace, options)
 
     tree = to_tree(found, missions, seed)
     if check and found.complaints:
@@ -193,18 +163,6 @@ def require_numbers_of_draws(
     return draws, require_count("chains", chains), warmup
 
 
-def require_poolable_with_model(
-    model: TrustModel, earlier: Sequence[Mission], robots: Sequence[str]
-) -> None:
-    """Raise TrustboError if a model needs the same robots in all missions and `earlier` has others.
-
-    A robot has no rates in the missions of other robots. Only models in which robots influence each
-    other cannot handle such gaps.
-    """
-    if model.joint and not model.exchangeable:
-        require_same_robots(type(model).__name__, earlier, robots)
-
-
 def _label_earlier(tree: xr.DataTree, n_earlier: int, others: Sequence[str]) -> None:
     """Label the earlier missions -n, ..., -1, and record which robots occur only in them."""
     for group in tree.children.values():
@@ -214,156 +172,3 @@ def _label_earlier(tree: xr.DataTree, n_earlier: int, others: Sequence[str]) -> 
             group.dataset = group.to_dataset().assign_coords(mission=labels)
     if others:
         tree.attrs["other_robots"] = list(others)
-
-
-def fit_class(
-    missions: Sequence[Mission],
-    model: TrustModel,
-    workspace: Workspace | None,
-    options: Options,
-) -> Fitted:
-    """Fit a model class to missions."""
-    model = model.for_features(missions[0].features)
-    density = Density(model, model.observations(missions, workspace))
-    record = json.dumps(model_to_record(model))
-    draws = options.draws or default_draws(model.effects, options.sampler)
-    if options.sampler == "importance":
-        first = _first_proposal(options.start, record)
-        with slow_bar("fit", " points", options.progress) as bar:
-            density.evaluated = bar.update
-            drawn, stats, summary = by_importance(
-                density, options.chains * draws, options.seed, first
-            )
-
-        stats = {name: values[None] for name, values in stats.items()}  # in one chain
-        notes = {"sample_stats": {"proposal": summary.pop("proposal")}}
-        complaints = []
-        if not summary["k_hat"] <= MAX_KHAT:
-            reason = f"k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT}"
-            complaints.append(f"importance weights are uneven ({reason})")
-    else:
-        drawn, stats, summary, complaints = sample_by_nuts(
-            density,
-            chains=options.chains,
-            draws=draws,
-            warmup=options.warmup,
-            seed=options.seed,
-            progress=options.progress,
-        )
-        stats = by_chain(stats, options.chains)
-        notes = {}
-
-    resolution = density.observations.resolution if model.likelihood.adds_noise else 0.0
-    return Fitted(
-        variables=to_variables(density, drawn),
-        prior=prior_parameters(density, N_PRIOR, np.random.default_rng([options.seed, 3])),
-        dims=model.dims,
-        labels={},
-        effects=model.effects,
-        observations=density.observations,
-        statistics=stats,
-        attrs={
-            "model": type(model).__name__,
-            "model_record": record,
-            **_described(model),
-            "resolution": resolution,
-            "sampler": options.sampler,
-            **summary,
-        },
-        notes=notes,
-        by_position=False,
-        complaints=complaints,
-        source=lambda tree: OfClass(density, stored_draws(density, tree)),
-    )
-
-
-def by_importance(
-    density: Density, n: int, seed: int, first: Student | None = None
-) -> tuple[JointDraws, dict[str, np.ndarray], dict[str, Any]]:
-    """Take n draws by importance sampling; return the draws, statistics (draw,) and a summary.
-
-    `first` is the first proposal. By default, or if its weights are uneven, the first proposal is
-    found by a search for the mode.
-    """
-    rng = np.random.default_rng(seed)
-    attempts = [(_SIZE, None), (_LAST_SIZE, None)]
-    if first:
-        attempts = [(_SIZE, first), *attempts]
-    while True:
-        size, proposal = attempts.pop(0)
-        if density.n_scores >= _MANY_SCORES:
-            size = 4 * size
-
-        drawn, log_p, summary = _draws(density, n, size, rng, proposal)
-        if summary["k_hat"] <= MAX_KHAT or not attempts:
-            return drawn, {"lp": log_p}, summary
-
-
-def _draws(
-    density: Density,
-    n: int,
-    size: int,
-    rng: np.random.Generator,
-    first: Student | None,
-) -> tuple[JointDraws, np.ndarray, dict[str, Any]]:
-    """Take n draws, beginning with the proposal `first` or with a search for the mode."""
-    if first is None:
-        start = density.start()
-    else:
-        start = first.center
-        density.run_ep(density.theta(start[None]))
-
-    visited: list[Coefficients] = []
-
-    def visit(z: np.ndarray) -> np.ndarray:
-        log_p, coefficients = density.visit(z, rng)
-        visited.append(coefficients)
-        return log_p
-
-    points = sample(
-        density.log_density, start[None], rng,
-        size=size, defensive=density.defensive, first=first, visit=visit,
-    )  # fmt: skip
-    coefficients = Coefficients.joined(visited)
-    proposal = points.proposal.text
-
-    if density.exact:
-        chosen = points.resample(n, rng)
-        c = coefficients.draw(chosen, rng)
-    else:
-        points, c = _corrected(density, points, coefficients, rng)
-        chosen = points.resample(n, rng)
-        c = c[chosen]
-
-    summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
-    drawn = JointDraws(density.theta(points.z[chosen]), c)
-    return drawn, points.log_p[chosen], summary | {"proposal": proposal}
-
-
-def _corrected(
-    density: Density, points: Points, coefficients: Coefficients, rng: np.random.Generator
-) -> tuple[Points, np.ndarray]:
-    """Draw coefficients (point, column) at all points, and correct the weights for errors of EP."""
-    c, log_q = coefficients.propose(np.arange(len(points.z)), rng)
-
-    some = np.flatnonzero(points.weight * len(points.z) > _NEGLIGIBLE)
-    log_ratio = points.log_ratio.copy()
-    log_ratio[some] += density.log_joint(points.z[some], c[some], rng)
-    log_ratio[some] -= log_q[some] + points.log_p[some]
-    return Points.from_log_weights(points.z, points.log_p, log_ratio, points.near), c
-
-
-def _first_proposal(start: xr.DataTree | None, record: str) -> Student | None:
-    """Return the proposal of a posterior of a model with this record, or None."""
-    if start is None or start.attrs["model_record"] != record:
-        return None
-
-    text = start["sample_stats"].attrs.get("proposal")
-    return None if text is None else Student.from_text(text)
-
-
-def _described(model: TrustModel) -> dict[str, Any]:
-    """Return the options and priors of a model as attributes of a posterior."""
-    options = {name: int(v) if isinstance(v, bool) else v for name, v in model.options().items()}
-    priors = {f"prior_{name}": text for name, text in model.priors.describe().items()}
-    return {**options, **model.x0, **priors}

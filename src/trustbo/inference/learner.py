@@ -12,7 +12,12 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_kind, see
-from trustbo.inference.classes import OfClass
+from trustbo.inference.classes import (
+    SAMPLERS,
+    OfClass,
+    fit_class,
+    require_poolable_with_model,
+)
 from trustbo.inference.draws import (
     as_fitted,
     in_order_of_features,
@@ -23,9 +28,9 @@ from trustbo.inference.draws import (
     sample_prior,
     sample_prior_ahead,
 )
-from trustbo.inference.fit import SAMPLERS, fit, require_poolable_with_model
 from trustbo.inference.functions.fit import (
     draws_of_function,
+    fit_function,
     prior_draws_of_function,
     prior_draws_of_function_ahead,
     require_learnable,
@@ -38,7 +43,8 @@ from trustbo.inference.functions.sampling import NUTS
 from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
 from trustbo.inference.functions.source import FunctionData, OfFunction
 from trustbo.inference.latent import Source
-from trustbo.inference.tree import parameters_alone, with_latent
+from trustbo.inference.options import Options
+from trustbo.inference.tree import Fitted, with_latent
 from trustbo.models.default import default_model
 from trustbo.models.draws import Draws
 from trustbo.models.model import TrustModel
@@ -83,10 +89,11 @@ class Learner:
         """Describe the model in a few words."""
         return self.known.in_short()
 
-    def fit(self, missions: Sequence[Mission], **options: Any) -> xr.DataTree:
-        """Fit the parameters to missions, without the groups of `add_latent`; see `fit`."""
-        model = getattr(self.known, "function", self.known)
-        return parameters_alone(fit(missions, model, latent=False, **options))
+    def sampled(
+        self, missions: Sequence[Mission], workspace: Workspace | None, options: Options
+    ) -> Fitted:
+        """Draw from the posterior given missions that are prepared; see `fit`."""
+        return fit_class(missions, self.known, workspace, options)
 
     def add_latent(
         self, posterior: xr.DataTree, missions: Sequence[Mission], *, progress: bool = True
@@ -111,9 +118,12 @@ class Learner:
         """Return plain values that identify the model in files."""
         return model_to_record(self.known)
 
-    def require_poolable(self, earlier: Sequence[Mission], workspace: Workspace) -> None:
-        """Raise TrustboError if the model cannot be fitted to missions of earlier campaigns."""
-        require_poolable_with_model(self.known, earlier, workspace.team.names)
+    def require_poolable(self, earlier: Sequence[Mission], robots: Sequence[str]) -> None:
+        """Raise TrustboError if the model cannot be fitted to missions of earlier campaigns.
+
+        `robots` are the names of the robots of the other missions.
+        """
+        require_poolable_with_model(self.known, earlier, robots)
 
     def source(
         self, posterior: xr.DataTree, missions: Sequence[Mission], *, contrasts: bool = True
@@ -157,9 +167,15 @@ class FunctionLearner(Learner):
         """See `Learner.record`."""
         return self.model.record()
 
-    def require_poolable(self, earlier: Sequence[Mission], workspace: Workspace) -> None:
+    def sampled(
+        self, missions: Sequence[Mission], workspace: Workspace | None, options: Options
+    ) -> Fitted:
+        """See `Learner.sampled`."""
+        return fit_function(missions, self.model, workspace, options)
+
+    def require_poolable(self, earlier: Sequence[Mission], robots: Sequence[str]) -> None:
         """See `Learner.require_poolable`."""
-        require_poolable_with_function(self.model, earlier, workspace.team.names)
+        require_poolable_with_function(self.model, earlier, robots)
 
     def source(
         self, posterior: xr.DataTree, missions: Sequence[Mission], *, contrasts: bool = True
@@ -186,6 +202,23 @@ class FunctionLearner(Learner):
         return self.prior_draws(_N_MEAN, 0, workspace).mean()
 
 
+def as_learner(model: Model | FunctionModel) -> Learner:
+    """Return the learner of a model; the same function always has the same `FunctionModel`.
+
+    Raises:
+        TrustboError: If the model is neither a trust model nor a NumPyro function.
+    """
+    if isinstance(model, TrustModel):
+        return Learner(model)
+
+    is_function = callable(model) and not isinstance(model, type)
+    if not is_function and not isinstance(model, FunctionModel):
+        page = see("howto/your-own-model")
+        remedy = f"give a model such as PooledTrust(), or a NumPyro function ({page})"
+        require_kind("model", model, TrustModel, remedy)
+    return FunctionLearner(as_model(model))
+
+
 def learner_of(
     model: Model | FunctionModel | None, workspace: Workspace, sampler: str | None = None
 ) -> Learner:
@@ -195,22 +228,14 @@ def learner_of(
         TrustboError: If the model is neither a trust model nor a NumPyro function, cannot plan, or
             cannot be sampled by this sampler.
     """
-    if model is None:
-        return Learner(default_model())
     if isinstance(model, HumanTrust):
         raise TrustboError("model: HumanTrust cannot plan paths; give PooledTrust() instead.")
-    if isinstance(model, TrustModel):
-        return Learner(model)
 
-    is_function = callable(model) and not isinstance(model, type)
-    if not is_function and not isinstance(model, FunctionModel):
-        page = see("howto/your-own-model")
-        remedy = f"give a trust model, such as PooledTrust(), or a NumPyro function ({page})"
-        require_kind("model", model, TrustModel, remedy)
-    function = as_model(model)
-    require_plannable(function, workspace)
-    require_learnable(function, workspace, by_gradient=sampler == NUTS)
-    return FunctionLearner(function)
+    learner = as_learner(default_model() if model is None else model)
+    if isinstance(learner, FunctionLearner):
+        require_plannable(learner.model, workspace)
+        require_learnable(learner.model, workspace, by_gradient=sampler == NUTS)
+    return learner
 
 
 def learner_from_record(record: dict[str, Any], given: Model | None = None) -> Learner:

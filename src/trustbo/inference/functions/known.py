@@ -19,12 +19,9 @@ def as_model(function: Callable[..., Any] | FunctionModel) -> FunctionModel:
 
     Raises TrustboError if the function cannot be a model; see `FunctionModel`.
     """
-    if isinstance(function, FunctionModel):
-        return function
-
-    model = FunctionModel(function)
+    model = function if isinstance(function, FunctionModel) else FunctionModel(function)
     known = _KNOWN.get(model.fingerprint)
-    if known is not None and known.function == function:
+    if known is not None and known.function == model.function:
         model = known
 
     _KNOWN[model.fingerprint] = model
