@@ -146,7 +146,7 @@ def test_the_density_is_that_of_one_large_normal(function, missions):
     found = target.log_density(x) - target._given(x)[0]
 
     n_missions, n_bounds, n_robots = target.effects.observations.contact_rate.shape
-    resolution = model.resolution(target.data)
+    resolution = target.effects.observations.resolution
     _, inputs = model.over_draws("form", 2, target.data)(prior, keys)
     for one in range(2):
         values = {name: v[one] for name, v in prior.items()}

@@ -38,7 +38,6 @@ from trustbo.inference.functions.sites import (
 from trustbo.models.backend import own_settings
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Effect
-from trustbo.models.observations import median_resolution
 from trustbo.models.scores import NOISES
 from trustbo.statespace import Inputs, StateSpace
 
@@ -202,13 +201,6 @@ class FunctionModel:
     def effects(self, data: Data) -> tuple[Effect, ...]:
         """Return the effects that the function adds to the drift."""
         return self.rates(data).effects
-
-    def resolution(self, data: Data) -> float:
-        """Return the resolution of rates that the function adds to its noise, or 0."""
-        if not self.rates(data).adds_resolution:
-            return 0.0
-        is_measured = ~np.isnan(data[RATES])
-        return float(median_resolution(np.where(is_measured, data["n_ticks"], 0.0)))
 
     def computed_sites(self, data: Data) -> dict[str, Site]:
         """Return the sites of `numpyro.deterministic` by name, except those with an axis of bounds.

@@ -61,9 +61,10 @@ class FunctionData:
         self.model = model
         self.data = data
         self.sites = model.sites(data)
-        self.resolution = model.resolution(data)
+        rates = model.rates(data)
+        self.resolution = observations.resolution if rates.adds_resolution else 0.0
         self.effects = AddedEffects(
-            model.effects(data),
+            rates.effects,
             observations,
             missions,
             workspace,
