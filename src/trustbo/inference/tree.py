@@ -13,7 +13,7 @@ from trustbo.display import slow_bar
 from trustbo.inference.draws import transposed
 from trustbo.inference.latent import N_TRAJECTORIES, Source, latent_of, replicate
 from trustbo.inference.place_maps import place_group
-from trustbo.models.backend import library_attrs
+from trustbo.models.backend import VERSIONS
 from trustbo.models.effects.effect import Effect
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.observations import Observations
@@ -121,9 +121,26 @@ def to_tree(found: Fitted, missions: Sequence[Mission], seed: int) -> xr.DataTre
         "robots": list(missions[0].robots),
         "features": list(missions[0].features),
         "seed": seed,
-        **library_attrs(found.attrs["sampler"]),
+        **_library_attrs(found.attrs["sampler"]),
     }
     return tree
+
+
+def _library_attrs(sampler: str) -> dict[str, str]:
+    """Return the attributes of a posterior that name the libraries that made it.
+
+    They include those that ArviZ writes, except for the time, so that a campaign that is resumed
+    gives the same files.
+    """
+    sampled_by = "numpyro" if sampler == "nuts" else "trustbo"
+    return {
+        "creation_library": "trustbo",
+        "creation_library_version": VERSIONS["trustbo"],
+        "creation_library_language": "Python",
+        "inference_library": sampled_by,
+        "inference_library_version": VERSIONS[sampled_by],
+        **{f"{name}_version": version for name, version in VERSIONS.items()},
+    }
 
 
 def by_chain(values: Mapping[str, np.ndarray], n_chains: int) -> dict[str, np.ndarray]:

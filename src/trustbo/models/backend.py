@@ -49,23 +49,6 @@ _MOST_BYTES = 1_000_000_000
 """Size of the stored programs beyond which JAX deletes those that were not used for longest."""
 
 
-def library_attrs(sampler: str) -> dict[str, str]:
-    """Return the attributes of a posterior that name the libraries that made it.
-
-    They include those that ArviZ writes, except for the time, so that a campaign that is resumed
-    gives the same files.
-    """
-    sampled_by = "numpyro" if sampler == "nuts" else "trustbo"
-    return {
-        "creation_library": "trustbo",
-        "creation_library_version": VERSIONS["trustbo"],
-        "creation_library_language": "Python",
-        "inference_library": sampled_by,
-        "inference_library_version": VERSIONS[sampled_by],
-        **{f"{name}_version": version for name, version in VERSIONS.items()},
-    }
-
-
 def special_functions(x: Any) -> Any:
     """Return `jax.scipy.special` for a JAX array, otherwise `scipy.special`."""
     return jax.scipy.special if isinstance(x, jax.Array) else special
