@@ -12,7 +12,7 @@ from trustbo.workspace import Workspace
 def prepare(
     missions: Iterable[Mission],
     workspace: Workspace | None = None,
-    earlier: Iterable[Mission] = (),
+    earlier: Sequence[Mission] = (),
 ) -> tuple[list[Mission], tuple[str, ...]]:
     """Prepare missions for a fit; see `trustbo.fit` for the arguments.
 
@@ -23,7 +23,6 @@ def prepare(
     Raises:
         TrustboError: There are no missions, or their robots or features differ.
     """
-    earlier = list_of_missions(earlier, "earlier")
     filled, known = fill(missions, workspace)
     own = [filled[j] for j in known]
 
