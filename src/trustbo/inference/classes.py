@@ -45,7 +45,7 @@ _SIZE = 256
 """Points per round of the importance sampler."""
 _LAST_SIZE = 1024
 """Points per round of the last attempt."""
-_MANY_SCORES = 12
+_MANY_SCORES = 13
 """Smallest number of scores for which a round has four times as many points."""
 _CHUNK = 32
 """Number of draws evaluated at once."""
