@@ -64,7 +64,8 @@ def filter_of(campaign):
     if campaign.state.last is not None:
         return TrustFilter(campaign.posterior)
     model = campaign.model
-    draws = sample_prior_ahead(model, campaign.workspace, 250, campaign.state.seed_of("prior"))
+    seed = campaign.state.seed_of("prior")
+    draws = sample_prior_ahead(model, campaign.workspace, 250, seed).drawn
     return TrustFilter(draws, 3, family=model.family, workspace=campaign.workspace)
 
 

@@ -109,8 +109,9 @@ def test_maps_are_over_the_posterior_and_lie_in_their_place(tmp_path):
     assert maps["cost"].sel(x=x, y=y) == maps["cost"].isel(y=1, x=2)
 
 
-def test_trust_in_a_robot_at_a_place_is_that_of_the_last_posterior(result, workspace):
-    draws = params_of(result.posterior, workspace)  # of robots, as their effects differ
+@pytest.mark.parametrize("options", [{}, {"expected": True}], ids=["drawn", "expected"])
+def test_trust_in_a_robot_at_a_place_is_that_of_the_last_posterior(result, workspace, options):
+    draws = params_of(result.posterior, workspace, next_mission=not options)
     z = workspace.awareness.values[1, :, 2, 3]  # of r2
     moves = np.flatnonzero(workspace.passable_bounds.values[:, 2, 3])
     drift = z[moves] @ draws.beta[:, 1].T + draws.b[:, 1] + draws.place[:, 0, 2, 3]
@@ -119,13 +120,13 @@ def test_trust_in_a_robot_at_a_place_is_that_of_the_last_posterior(result, works
     drift = drift + own.everywhere()[:, 1, moves, 2, 3].T
     expected = drift.mean(0) / (1.0 - draws.beta0[:, 1])
 
-    trust = result.trust("r2", (2, 3))
+    trust = result.trust("r2", (2, 3), **options)
     np.testing.assert_allclose(trust, expected, rtol=1e-9)
     assert trust.dims == ("draw",)
     x, y = workspace.grid.center((2, 3))
-    assert result.trust("r2", {"x": x, "y": y}).identical(trust)
-    np.testing.assert_allclose(result.trust()[:, 1, 2, 3], expected, rtol=1e-9)
-    maps = result.robot_maps()
+    assert result.trust("r2", {"x": x, "y": y}, **options).identical(trust)
+    np.testing.assert_allclose(result.trust(**options)[:, 1, 2, 3], expected, rtol=1e-9)
+    maps = result.robot_maps(**options)
     np.testing.assert_allclose(maps["trust_mean"].sel(robot="r2")[2, 3], expected.mean())
     np.testing.assert_allclose(maps["trust_sd"].sel(robot="r2")[2, 3], expected.std())
 
@@ -135,10 +136,32 @@ def test_trust_before_anything_is_learned_is_that_of_the_prior(workspace):
     trust = campaign.trust("r2", (2, 3))
     draws = campaign.draw_prior(len(trust))
     moves = np.flatnonzero(workspace.passable_bounds.values[:, 2, 3])
-    z = workspace.awareness.values[1, moves, 2, 3].mean(0)
-    expected = (draws.beta @ z + draws.b) / (1.0 - draws.beta0)
-    np.testing.assert_allclose(trust, expected, rtol=1e-9)
-    assert trust.std() > 0.1
+    z = workspace.awareness.values[1, moves, 2, 3]
+    without = (draws.beta @ z.T + draws.b[:, None]) / (1.0 - draws.beta0[:, None])
+
+    # Expected effects of robots are 0, so that places are all that is added.
+    ahead = campaign.forecast
+    places = ahead.place[:, 0, 2, 3, None] + ahead.place_bound[:, 0, moves, 2, 3]
+    places = places + ahead.place_robot.everywhere()[:, 1, moves, 2, 3]
+    expected = (without + places / (1.0 - draws.beta0[:, None])).mean(1)
+    found = campaign.trust("r2", (2, 3), expected=True)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+    # No feature predicts line of sight, so drawn effects have the variance tau_slow^2 +
+    # tau_mission^2, whose expected value is twice the squared scale of the half-normal priors.
+    added = (trust - found).values
+    assert abs(added.mean()) < 4.0 * added.std() / np.sqrt(len(added))
+    np.testing.assert_allclose(added.std(), np.sqrt(2.0) * 0.2, rtol=0.3)
+
+    # Maps have the largest trust of many paths, and so no effects of unknown places.
+    of_prior = campaign.planner.maps(campaign.draw_prior(20))
+    xr.testing.assert_equal(campaign.maps(n_draws=20), of_prior)
+
+
+def test_maps_of_a_result_are_those_of_its_posterior(result):
+    for options in ({}, {"expected": True}):
+        maps = result.planner.maps(result.posterior, **options)
+        xr.testing.assert_allclose(result.maps(**options), maps, rtol=1e-9)
 
 
 def test_features_named_like_maps_are_renamed_in_maps():

@@ -233,7 +233,7 @@ def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
     effects = (PlaceEffect(0.2, 0.1, 0.15), RobotEffect(0.3, 0.4))
     z = np.random.default_rng(1).uniform(size=(3, 8, 4, 5, 2))
     workspace = tb.Workspace.from_awareness(z, features=("traversability", "line_of_sight"))
-    draws = sample_prior_ahead(PooledTrust(effects=effects), workspace, 6000, 1)
+    draws = sample_prior_ahead(PooledTrust(effects=effects), workspace, 6000, 1).drawn
 
     assert draws.place.shape == (6000, 1, 4, 5)
     assert draws.place_bound.shape == (6000, 1, 8, 4, 5)
@@ -250,7 +250,7 @@ def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
     expected = (0.3**2 + 0.4**2) * 2.0 / 3.0  # around the mean of three robots
     assert own[..., 1].var(0).mean() == pytest.approx(expected, rel=0.1)
     np.testing.assert_allclose(own[..., 0], 0.0, atol=1e-12)
-    again = sample_prior_ahead(PooledTrust(effects=effects), workspace, 6000, 1)
+    again = sample_prior_ahead(PooledTrust(effects=effects), workspace, 6000, 1).drawn
     np.testing.assert_array_equal(again.place, draws.place)
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+import xarray as xr
 from missions import walking_missions
 from scipy.special import expit
 from scipy.stats import norm
@@ -13,7 +14,14 @@ import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import params_of, sample_prior
 from trustbo.inference.learner import learner_of
-from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, TrustParams
+from trustbo.models import (
+    CoupledTrust,
+    HierarchicalTrust,
+    PlaceEffect,
+    PooledTrust,
+    RobotEffect,
+    TrustParams,
+)
 from trustbo.planning import Planner, expected_trust, robot_trust
 from trustbo.workspace.moves import MOVE_NAMES, MOVES
 
@@ -163,6 +171,78 @@ def test_trust_in_a_robot_has_its_own_effect_in_the_bound_and_that_of_the_team_h
 
     mean = planner.trust(params_of(posterior, alike), cell=cell, move=move).values
     np.testing.assert_allclose(mean, np.broadcast_to(team, mean.shape), atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def with_robot_effects():
+    """A posterior with effects of robots in proportion to line of sight, and its workspace."""
+    rng = np.random.default_rng(5)
+    features = ("line_of_sight", "visibility")
+    missions = []
+    for mission in walking_missions(1, 5, shape=(4, 4), missing=0.0):
+        z = rng.uniform(size=mission.awareness.shape)
+        rates = z[..., 0] - [0.0, 0.2, 0.0] + rng.normal(0.0, 0.15, 3)
+        rates = np.clip(rates + rng.normal(0.0, 0.05, z.shape[:2]), 0.0, 1.0)
+        missions.append(tb.Mission.from_arrays(mission.path, z, rates, features=features))
+
+    model = PooledTrust(effects=[PlaceEffect(), RobotEffect()])
+    posterior = tb.fit(missions, model, draws=4000, progress=False, check=False, latent=False)
+    z = rng.uniform(size=(3, 8, 4, 4, 2))
+    return posterior, tb.Workspace.from_awareness(z, features=features)
+
+
+def test_trust_of_the_next_mission_has_the_variance_of_the_next_effects(with_robot_effects):
+    posterior, workspace = with_robot_effects
+    planner = Planner(workspace, *ENDS)
+    bound = {"cell": (2, 2), "move": "s"}
+    drawn = planner.trust(posterior, **bound).values
+    expected = planner.trust(posterior, **bound, expected=True).values
+    sight = workspace.awareness.values[:, MOVE_NAMES.index("s"), 2, 2, 0]
+
+    # The variance of the next effect, given those of the n missions before, for each draw.
+    theta = posterior["posterior"].to_dataset().squeeze("chain")
+    slow = theta["tau_slow"].values[:, None, None] ** 2
+    day = theta["tau_mission"].values[:, None, None] ** 2
+    n = posterior.attrs["n_missions"]
+    lag = np.abs(np.subtract.outer(np.arange(n + 1), np.arange(n + 1)))
+    cov = slow * 0.9**lag + day * np.eye(n + 1)
+    known, ahead = cov[:, :n, :n], cov[:, :n, n]
+    explained = np.linalg.solve(known, ahead[..., None])[..., 0]
+    variance = cov[:, n, n] - (explained * ahead).sum(1)
+
+    # The difference of a draw is normal with this variance times squared sight.
+    n_draws = len(drawn)
+    unit = (drawn - expected) / (sight * np.sqrt(variance)[:, None])
+    assert np.abs(unit.mean(0)).max() < 4.0 / np.sqrt(n_draws)
+    np.testing.assert_allclose(unit.var(0), 1.0, atol=4.0 * np.sqrt(2.0 / n_draws))
+    assert np.abs(np.corrcoef(unit.T) - np.eye(3)).max() < 4.0 / np.sqrt(n_draws)
+
+    # So the mean of trust stays, and its variance is larger by the mean of these variances.
+    added = variance.mean() * sight**2
+    assert (np.abs(drawn.mean(0) - expected.mean(0)) < 4.0 * np.sqrt(added / n_draws)).all()
+    grown = drawn.var(0) - expected.var(0)
+    np.testing.assert_allclose(grown, added, rtol=0.15)
+
+
+def test_maps_of_the_next_mission_are_those_of_drawn_effects(with_robot_effects):
+    posterior, workspace = with_robot_effects
+    planner = Planner(workspace, *ENDS)
+    drawn = params_of(posterior, workspace, next_mission=True)
+    plans = params_of(posterior, workspace)
+    for name in ("robot_maps", "maps", "trust_map", "cost_map"):
+        maps = getattr(planner, name)
+        found = maps(posterior)
+        of_drawn = maps(drawn)
+        of_expected = maps(posterior, expected=True)
+        if name == "maps":  # paths are planned for expected effects
+            paths = maps(plans)["path_probability"]
+            xr.testing.assert_equal(of_expected["path_probability"], paths)
+            of_drawn = of_drawn.assign(path_probability=paths)
+        xr.testing.assert_equal(found, of_drawn)
+        assert not of_expected.equals(found)
+
+    # The mean over robots has no effects of robots in bounds, so that maps are those of plans.
+    xr.testing.assert_allclose(planner.maps(posterior, expected=True), planner.maps(plans))
 
 
 @pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])

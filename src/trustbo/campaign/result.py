@@ -23,8 +23,10 @@ from trustbo.hazard.risk import BoundRisk
 from trustbo.inference.learner import Learner
 from trustbo.inference.score import Posteriors
 from trustbo.models.backend import VERSIONS
-from trustbo.models.draws import Draws
+from trustbo.models.draws import Draws, NextMission
+from trustbo.parallel import computing
 from trustbo.planning import InfeasibleError, Plan, Planner
+from trustbo.planning.maps import maps_of
 from trustbo.simulation import Truth
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -32,10 +34,8 @@ from trustbo.workspace.grid import Location
 if TYPE_CHECKING:
     from trustbo.plots.explorer import Explorer
 
-_N_PRIOR_DRAWS = 1000
-"""Number of prior draws for `Result.trust` before anything was learned."""
-_N_PRIOR_AHEAD = 250
-"""Number of prior draws for bands; they contain place effects of all cells, which are large."""
+_N_PRIOR_DRAWS = 250
+"""Number of prior draws for intervals; they contain place effects of all cells, which are large."""
 _FIRST_COLUMNS = (
     "mission",
     "status",
@@ -180,30 +180,29 @@ class Result(Summary):
     @computed
     def belief(self) -> Draws:
         """Parameter draws of the last posterior, or of the prior before anything was learned."""
-        if self._drawn is not None:
-            return self._drawn[0]
+        if self.state.last is not None:
+            return self._ahead.expected
         if self.state.settings["initial"] == "prior_draw":
             return self.draw_prior(1)
         return self.learner.prior_mean(self.workspace)
 
-    @computed
+    @property
     def forecast(self) -> Draws:
-        """Draws like `belief`, for bands: with effects of robots in bounds and the next mission.
+        """Draws like `belief`, for intervals: with effects of robots in the next mission drawn.
 
-        Before anything was learned, they are draws of the prior.
+        They include the effects of robots in bounds. Before anything was learned, they are draws of
+        the prior.
         """
-        if self._drawn is not None:
-            return self._drawn[1]
-        seed = State(self.state.settings).seed_of("prior")
-        return self.learner.prior_draws_ahead(_N_PRIOR_AHEAD, seed, self.workspace)
+        return self._ahead.drawn
 
     @computed
-    def _drawn(self) -> tuple[Draws, Draws] | None:
-        """The draws of the last posterior, read once for `belief` and `forecast`."""
+    def _ahead(self) -> NextMission:
+        """Draws of the last posterior, or of the prior, for the next mission."""
         posterior = self.state.posterior
-        if posterior is None:
-            return None
-        return self.learner.expected_and_drawn(posterior, self.workspace)
+        if posterior is not None:
+            return self.learner.next_mission(posterior, self.workspace)
+        seed = State(self.state.settings).seed_of("prior")
+        return self.learner.first_mission(_N_PRIOR_DRAWS, seed, self.workspace)
 
     def draw_prior(self, n_draws: int) -> Draws:
         """Draw parameters from the prior, with a leading axis (draw,)."""
@@ -256,12 +255,12 @@ class Result(Summary):
         *,
         move: str | None = None,
         as_rate: bool = False,
+        expected: bool = False,
     ) -> xr.DataArray:
-        """Compute how trustworthy a robot is while the lead enters a cell, after all missions.
+        """Compute how trustworthy a robot will be while the lead enters a cell.
 
-        The draws are those of the last posterior, with the expected effects of robots in the next
-        mission and the effects of robots in bounds. Before anything was learned, they are drawn
-        from the prior, without the effects of places and robots, which are 0 on average.
+        The draws are those of the last posterior or, before anything was learned, of the prior.
+        They contain the effects of places and of robots in the next mission.
 
         Args:
             robot: Name of a robot of T2; by default all robots.
@@ -270,6 +269,8 @@ class Result(Summary):
             move: Direction of the bound that enters the cell, such as `"ne"`; by default the mean
                 over all directions.
             as_rate: Whether to return the expected contact rate instead of trust.
+            expected: Whether to use the expected effects of robots in the next mission, instead of
+                drawing them.
 
         Returns:
             Stationary trust of each posterior draw, as a DataArray with the dims (draw, robot, row,
@@ -283,26 +284,21 @@ class Result(Summary):
             >>> trust = result.trust("r2", (3, 4))
             >>> float(trust.mean()), float(trust.std())
         """
-        return self._base.trust(self._beliefs, robot, cell, move=move, as_rate=as_rate)
+        draws = self._ahead.of_robots(expected=expected)
+        return self._base.trust(draws, robot, cell, move=move, as_rate=as_rate)
 
-    def robot_maps(self) -> xr.Dataset:
-        """Compute maps of the trust in each robot after all missions.
+    def robot_maps(self, *, expected: bool = False) -> xr.Dataset:
+        """Compute maps of the trust in each robot in the next mission.
 
-        The draws are those of `trust`.
+        Args:
+            expected: Whether to use the expected effects of robots in the next mission, instead of
+                drawing them; see `trust`.
 
         Returns:
             Dataset with the dims (robot, y, x) of the mean `trust_mean` and standard deviation
             `trust_sd` of trust, and the mean `contact_rate`; see `planning.Planner.robot_maps`.
         """
-        return self._base.robot_maps(self._beliefs)
-
-    @property
-    def _beliefs(self) -> Draws:
-        """Draws of the last posterior, or of the prior before anything was learned."""
-        if self._drawn is None:
-            return self.draw_prior(_N_PRIOR_DRAWS)
-        expected, drawn = self._drawn
-        return expected.with_robots_in_bounds(drawn)
+        return self._base.robot_maps(self._ahead.of_robots(expected=expected))
 
     @computed
     def trust_map(self) -> xr.DataArray:
@@ -364,20 +360,28 @@ class Result(Summary):
         table = pd.DataFrame(rows, columns=list(columns))
         return table.astype({"mission": "Int64"}).set_index("mission")
 
-    def maps(self, *, n_draws: int = 250) -> xr.Dataset:
+    @computing()
+    def maps(self, *, n_draws: int = 250, expected: bool = False) -> xr.Dataset:
         """Compute maps of the cells after the last mission; see `planning.Planner.maps`.
 
-        Before anything was learned, the maps are those of the prior (see `trust`).
+        Before anything was learned, the maps are those of the prior without effects.
 
         Args:
             n_draws: Number of draws.
+            expected: Whether to use the expected effects of robots in the next mission, instead of
+                drawing them; see `trust`.
 
         Returns:
             Dataset with the dims (y, x), whose coordinates are the centres of the cells in CRS
             metres; `isel(y=row, x=col)` selects a cell, and the accessor `.rio` writes rasters.
         """
-        draws = self._beliefs if self.state.posterior is None else self.belief
-        return self.planner.maps(draws, n_draws=n_draws)
+        if self.state.last is None:
+            # The largest trust of many paths would be far too high with unknown effects of places.
+            prior = self.draw_prior(n_draws)
+            ahead = NextMission(prior, prior)
+        else:
+            ahead = self._ahead
+        return maps_of(self.planner.problem, ahead, n_draws, 0, expected=expected)
 
     def plot_maps(self, **options: Any) -> np.ndarray:
         """Plot trust maps and paths of four missions; see `plots.trust_maps` for the options."""

@@ -22,6 +22,7 @@ from trustbo.inference.place_maps import (
     robots_in_bounds_of,
 )
 from trustbo.inference.variables import draws_of, prior_parameters
+from trustbo.models.draws import NextMission
 from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
@@ -547,7 +548,9 @@ def sample_prior(
     return assemble_params(parameters, **model.x0, memory=model.memory)
 
 
-def sample_prior_ahead(model: TrustModel, workspace: Workspace, n_draws: int, seed: int) -> Params:
+def sample_prior_ahead(
+    model: TrustModel, workspace: Workspace, n_draws: int, seed: int
+) -> NextMission:
     """Draw parameters (draw, ...) from the prior, with the effects of places and of robots.
 
     The effects of robots are those of the first mission.
@@ -566,9 +569,14 @@ def sample_prior_ahead(model: TrustModel, workspace: Workspace, n_draws: int, se
     parameters |= {name: drawn[name] for name in model.effect_dims}
 
     theta = model.derived(parameters)
-    values, places = with_prior_effects_ahead(workspace, model.effects, theta, parameters, seed)
-    params = assemble_params(values, **model.x0, memory=model.memory, **places)
-    return params.in_order(workspace.team.names, workspace.features)
+    names = workspace.team.names, workspace.features
+    expected, drawn = (
+        assemble_params(values, **model.x0, memory=model.memory, **places).in_order(*names)
+        for values, places in with_prior_effects_ahead(
+            workspace, model.effects, theta, parameters, seed
+        )
+    )
+    return NextMission(expected, drawn)
 
 
 def with_prior_effects_ahead(
@@ -577,10 +585,11 @@ def with_prior_effects_ahead(
     theta: Theta,
     parameters: Mapping[str, np.ndarray],
     seed: int,
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+) -> list[tuple[dict[str, np.ndarray], dict[str, Any]]]:
     """Return parameters with the effects of the first mission from the prior; see `with_effects`.
 
-    `theta` and `parameters` contain draws (draw, ...) from the prior by name.
+    The effects of robots are first those expected, then drawn at random. `theta` and `parameters`
+    contain draws (draw, ...) from the prior by name.
     """
     robots = workspace.team.names
     n_draws = len(theta["inverse_gain"])
@@ -597,8 +606,7 @@ def with_prior_effects_ahead(
     never = {"robot_effect": np.zeros((n_draws, 0, len(robots)))}
     values = dict.fromkeys(_effects_of_robots(effects), never)
     ahead = _Ahead(theta, parameters, robots, workspace.features, workspace)
-    [found] = ahead.with_effects(group, values, 0, [True])
-    return found
+    return ahead.with_effects(group, values, 0, [False, True])
 
 
 def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:

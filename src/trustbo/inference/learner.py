@@ -46,7 +46,7 @@ from trustbo.inference.latent import Source
 from trustbo.inference.options import Options
 from trustbo.inference.tree import Fitted, with_latent
 from trustbo.models.default import default_model
-from trustbo.models.draws import Draws
+from trustbo.models.draws import Draws, NextMission
 from trustbo.models.model import TrustModel
 from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_from_record, model_to_record
@@ -107,12 +107,10 @@ class Learner:
         """Return all draws of a posterior; see `params_of`."""
         return self.read(posterior, workspace, [next_mission])[0]
 
-    def expected_and_drawn(
-        self, posterior: xr.DataTree, workspace: Workspace | None
-    ) -> tuple[Draws, Draws]:
+    def next_mission(self, posterior: xr.DataTree, workspace: Workspace | None) -> NextMission:
         """Return `draws` without and with `next_mission`; the posterior is read once."""
         expected, drawn = self.read(posterior, workspace, [False, True])
-        return expected, drawn
+        return NextMission(expected, drawn)
 
     def record(self) -> dict[str, Any]:
         """Return plain values that identify the model in files."""
@@ -147,7 +145,7 @@ class Learner:
         n_robots = workspace.team.n_robots
         return sample_prior(model, len(workspace.features), n_draws, seed, n_robots=n_robots)
 
-    def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
+    def first_mission(self, n_draws: int, seed: int, workspace: Workspace) -> NextMission:
         """Draw parameters from the prior with the effects of the first mission."""
         model = self.known.for_features(workspace.features)
         return sample_prior_ahead(model, workspace, n_draws, seed)
@@ -193,8 +191,8 @@ class FunctionLearner(Learner):
         """See `Learner.prior_draws`."""
         return prior_draws_of_function(self.model, n_draws, seed, workspace)
 
-    def prior_draws_ahead(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
-        """See `Learner.prior_draws_ahead`."""
+    def first_mission(self, n_draws: int, seed: int, workspace: Workspace) -> NextMission:
+        """See `Learner.first_mission`."""
         return prior_draws_of_function_ahead(self.model, n_draws, seed, workspace)
 
     def prior_mean(self, workspace: Workspace) -> Draws:
@@ -302,12 +300,10 @@ def params_of(
 
 
 @computing()
-def expected_and_drawn(
-    posterior: xr.DataTree, workspace: Workspace | None = None
-) -> tuple[Draws, Draws]:
+def next_mission_of(posterior: xr.DataTree, workspace: Workspace | None = None) -> NextMission:
     """Return `params_of` without and with `next_mission`; the posterior is read once."""
     posterior = as_fitted("params_of", posterior)
-    return learner_of_posterior(posterior).expected_and_drawn(posterior, workspace)
+    return learner_of_posterior(posterior).next_mission(posterior, workspace)
 
 
 @computing()

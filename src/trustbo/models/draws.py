@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -352,15 +352,29 @@ class Draws(Summary):
         record: dict[str, Any] = {name: value.tolist() for name, value in self.values.items()}
         return record if self.carried else {**record, "memory": self.memory}
 
-    def with_robots_in_bounds(self, other: "Draws") -> Self:
-        """Return the draws with the effects of robots in bounds of other draws, if any."""
-        return self._with(place_robot=other.place_robot)
-
     def _with(self, **fields: Any) -> Self:
         """Return a copy with other values of some fields."""
         changed = copy(self)
         vars(changed).update(fields)
         return changed
+
+
+class NextMission(NamedTuple):
+    """Draws for the next mission, with the effects of robots in it expected or drawn.
+
+    Attributes:
+        expected: Draws with expected effects and without those of robots in bounds, for planning.
+        drawn: Draws with effects drawn at random and those of robots in bounds, for intervals.
+    """
+
+    expected: Draws
+    drawn: Draws
+
+    def of_robots(self, *, expected: bool) -> Draws:
+        """Return draws for trust in single robots, with the effects of robots in bounds."""
+        if expected:
+            return self.expected._with(place_robot=self.drawn.place_robot)
+        return self.drawn
 
 
 def _positions(axis: str, own: Sequence[str], wanted: Sequence[str]) -> list[int] | None:

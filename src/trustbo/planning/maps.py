@@ -3,19 +3,23 @@
 import numpy as np
 import xarray as xr
 
-from trustbo.models.draws import Draws
-from trustbo.planning.draws import drawn_paths
+from trustbo.models.draws import NextMission
+from trustbo.planning.draws import choose_draws, drawn_paths
 from trustbo.planning.problem import InfeasibleError, Problem
 from trustbo.planning.trust_map import cost_of, trust_map
 
 
-def maps_of(problem: Problem, draws: Draws) -> xr.Dataset:
-    """Return the maps of `Planner.maps` for draws with a leading axis (draw,)."""
+def maps_of(
+    problem: Problem, ahead: NextMission, n_draws: int | None, seed: int, *, expected: bool
+) -> xr.Dataset:
+    """Return the maps of `Planner.maps`, for whose other arguments see there."""
+    draws = choose_draws(ahead.of_robots(expected=expected), n_draws, seed)
+    of_plans = choose_draws(ahead.expected, n_draws, seed)
     workspace = problem.paths.workspace
     trust = trust_map(problem, draws)
     passable = workspace.passable
     try:
-        share = drawn_paths(problem, draws).share()
+        share = drawn_paths(problem, of_plans).share()
     except InfeasibleError as error:
         share = np.zeros(passable.shape)
         share[tuple(np.array(error.path).T)] = 1.0

@@ -34,14 +34,7 @@ from trustbo.planning.maps import maps_of
 from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import Plan
-from trustbo.planning.problem import (
-    EXACT,
-    Problem,
-    draws_of,
-    mean_and_draws_of,
-    mean_of,
-    robot_draws_of,
-)
+from trustbo.planning.problem import EXACT, Problem, draws_of, mean_and_draws_of, mean_of
 from trustbo.planning.recursion import Recursion
 from trustbo.planning.robot_trust import robot_maps, robot_trust
 from trustbo.planning.trust_map import cost_of, trust_map
@@ -271,7 +264,8 @@ class Planner(Summary):
 
         Args:
             params: Posterior from `fit`, or parameters. If there are several draws, the path is
-                optimal for their mean, and the bands are quantiles over the draws.
+                optimal for their mean, and the bands are quantiles over the draws. For a posterior,
+                the mean has the expected effects of robots, and the bands those of `evaluate`.
             x0: Expected trust at the start, shape () or (robot,), or labelled with the names of the
                 robots. The default is `params.x0_mean`.
 
@@ -308,7 +302,7 @@ class Planner(Summary):
     def plan_draws(
         self, posterior: Draws | xr.DataTree, *, n_draws: int | None = None, seed: int = 0
     ) -> DrawnPaths:
-        """Find the best path for each draw of a posterior.
+        """Find the best path for each draw of a posterior, with the expected effects of robots.
 
         Args:
             posterior: Posterior from `fit`, or parameters with leading axis (draw,).
@@ -320,8 +314,8 @@ class Planner(Summary):
             InfeasibleError: If no path respects `max_failure`.
         """
         self.problem.require_family(posterior)
-        params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
-        return drawn_paths(self.problem, params)
+        ahead = draws_of(posterior, self.workspace)
+        return drawn_paths(self.problem, choose_draws(ahead.expected, n_draws, seed))
 
     @computing()
     def evaluate(
@@ -343,9 +337,8 @@ class Planner(Summary):
         """
         self.problem.require_family(params)
         path = self.require_path(path)
-        return evaluated(
-            self.problem, path, draws_of(params, self.workspace, next_mission=True), None, x0
-        )
+        draws = draws_of(params, self.workspace).drawn
+        return evaluated(self.problem, path, draws, None, x0)
 
     @computing()
     def graph(self, params: Draws | xr.DataTree) -> nx.DiGraph:
@@ -399,6 +392,7 @@ class Planner(Summary):
         *,
         move: str | None = None,
         as_rate: bool = False,
+        expected: bool = False,
     ) -> xr.DataArray:
         """Compute how trustworthy a robot is while the lead enters a cell.
 
@@ -418,6 +412,8 @@ class Planner(Summary):
             as_rate: Whether to return the expected contact rate at this trust, in [0, 1]. The mean
                 of Gaussian contact rates is trust, limited to [0, 1]. For the family
                 `"beta_binomial"`, trust is the logit of the contact rate.
+            expected: Whether to use the expected effects of robots in the next mission, instead of
+                drawing them. Parameters, unlike a posterior, are used as they are.
 
         Returns:
             DataArray with the dims (draw, robot, row, col). The dims of a given robot or cell are
@@ -432,18 +428,20 @@ class Planner(Summary):
             >>> planner.trust(posterior, "r2", (3, 4)).quantile([0.05, 0.5, 0.95])
         """
         self.problem.require_family(params, uses_rates=as_rate)
-        draws = robot_draws_of(params, self.workspace)
+        draws = draws_of(params, self.workspace).of_robots(expected=expected)
         family = self.problem.likelihood
         return robot_trust(self.workspace, family, draws, robot, cell, move=move, as_rate=as_rate)
 
     @computing()
-    def robot_maps(self, posterior: Draws | xr.DataTree) -> xr.Dataset:
+    def robot_maps(self, posterior: Draws | xr.DataTree, *, expected: bool = False) -> xr.Dataset:
         """Compute maps of the trust in each robot under a posterior.
 
         The draws are processed in parts, so large maps fit in memory.
 
         Args:
             posterior: Posterior from `fit`, or parameters of any model.
+            expected: Whether to use the expected effects of robots in the next mission, instead of
+                drawing them; see `trust`.
 
         Returns:
             Dataset with the dims (robot, y, x), whose coordinates are those of `maps`. The
@@ -451,12 +449,17 @@ class Planner(Summary):
             the mean `contact_rate` of `trust(as_rate=True)`. Cells that no bound enters are NaN.
         """
         self.problem.require_family(posterior, uses_rates=True)
-        draws = robot_draws_of(posterior, self.workspace)
+        draws = draws_of(posterior, self.workspace).of_robots(expected=expected)
         return robot_maps(self.workspace, self.problem.likelihood, draws)
 
     @computing()
     def trust_map(
-        self, params: Draws | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
+        self,
+        params: Draws | xr.DataTree,
+        *,
+        per_robot: bool = False,
+        x0: ArrayLike | None = None,
+        expected: bool = False,
     ) -> xr.DataArray:
         """Compute the largest expected trust on arrival at each cell; NaN if it is unreachable.
 
@@ -471,21 +474,33 @@ class Planner(Summary):
             params: Posterior from `fit`, or parameters of any model.
             per_robot: Whether to compute one map per robot instead of one for the team.
             x0: Expected trust at the start, shape () or (robot,); by default `params.x0_mean`.
+            expected: Whether to use the expected effects of robots in the next mission, instead of
+                drawing them; see `trust`.
         """
-        draws = draws_of(params, self.workspace)
+        draws = draws_of(params, self.workspace).of_robots(expected=expected)
         trust = trust_map(self.problem, draws, per_robot=per_robot, x0=x0)
         return trust if draws.n_draws > 1 else trust.isel(draw=0)
 
     @computing()
     def cost_map(
-        self, params: Draws | xr.DataTree, *, per_robot: bool = False, x0: ArrayLike | None = None
+        self,
+        params: Draws | xr.DataTree,
+        *,
+        per_robot: bool = False,
+        x0: ArrayLike | None = None,
+        expected: bool = False,
     ) -> xr.DataArray:
         """Compute the cost f = 1 - sigma(trust) of each cell, equation (6), from `trust_map`."""
-        return cost_of(self.trust_map(params, per_robot=per_robot, x0=x0))
+        return cost_of(self.trust_map(params, per_robot=per_robot, x0=x0, expected=expected))
 
     @computing()
     def maps(
-        self, posterior: Draws | xr.DataTree, *, n_draws: int = 250, seed: int = 0
+        self,
+        posterior: Draws | xr.DataTree,
+        *,
+        n_draws: int = 250,
+        seed: int = 0,
+        expected: bool = False,
     ) -> xr.Dataset:
         """Compute maps of the cells under a posterior, for GIS and figures.
 
@@ -493,6 +508,8 @@ class Planner(Summary):
             posterior: Posterior from `fit`, or parameters with leading axis (draw,).
             n_draws: Number of draws, chosen at random without replacement.
             seed: Seed for choosing the draws.
+            expected: Whether to use the expected effects of robots in the next mission, instead of
+                drawing them; see `trust`. Plans, and so `path_probability`, always use them.
 
         Returns:
             Dataset with dims (y, x), whose coordinates are the cell centres in CRS metres;
@@ -504,8 +521,8 @@ class Planner(Summary):
             effects, there are also their `place_mean` and `place_sd`. Impassable cells are NaN. The
             attribute `start` of the maps of trust and cost is the start, where trust is assumed.
         """
-        params = choose_draws(draws_of(posterior, self.workspace), n_draws, seed)
-        return maps_of(self.problem, params)
+        ahead = draws_of(posterior, self.workspace)
+        return maps_of(self.problem, ahead, n_draws, seed, expected=expected)
 
 
 def _bound_cost_of(bound_cost: ArrayLike, bounds: np.ndarray) -> np.ndarray:

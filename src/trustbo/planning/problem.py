@@ -13,8 +13,8 @@ from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.hazard.path_risk import ROUNDING, Risk
-from trustbo.inference.learner import expected_and_drawn, params_of
-from trustbo.models.draws import Draws
+from trustbo.inference.learner import next_mission_of
+from trustbo.models.draws import Draws, NextMission
 from trustbo.models.families import FAMILIES, Family
 from trustbo.planning.labels import best_labels
 from trustbo.planning.limits import LOGISTIC, LOSSES, TINY_SD, Costs
@@ -395,51 +395,29 @@ def risks_by_bound(p_fail: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(risk_of(p_fail).reshape(len(p_fail), -1).T)
 
 
-def draws_of(
-    posterior: Draws | xr.DataTree, workspace: Workspace, *, next_mission: bool = False
-) -> Draws:
-    """Return the draws of a posterior or parameters.
+def draws_of(params: Draws | xr.DataTree, workspace: Workspace) -> NextMission:
+    """Return the draws of a posterior for the next mission; parameters are used as they are.
 
-    The features and robots are reordered by name to match the workspace, if they have names. See
-    `params_of` for `next_mission`. Raises TrustboError if the type, the features or the robots
-    are wrong.
+    The features and robots are reordered by name to match the workspace, if they have names.
+    Raises TrustboError if the type, the features or the robots are wrong.
     """
-    if isinstance(posterior, xr.DataTree):
-        return params_of(posterior, workspace, next_mission=next_mission)
-    return _require_draws(posterior, workspace)
+    if isinstance(params, xr.DataTree):
+        return next_mission_of(params, workspace)
 
-
-def _require_draws(given: object, workspace: Workspace) -> Draws:
-    """Return draws that can be used in a workspace."""
     remedy = "give a posterior from fit, or parameters"
-    draws: Draws = require_kind("posterior", given, Draws, remedy)
-    return draws.in_order(workspace.team.names, workspace.features)
-
-
-def robot_draws_of(posterior: Draws | xr.DataTree, workspace: Workspace) -> Draws:
-    """Return the same as `draws_of`, but with the effects of robots in bounds, which plans omit."""
-    if isinstance(posterior, xr.DataTree):
-        expected, drawn = expected_and_drawn(posterior, workspace)
-        return expected.with_robots_in_bounds(drawn)
-    return _require_draws(posterior, workspace)
+    draws: Draws = require_kind("posterior", params, Draws, remedy)
+    draws = draws.in_order(workspace.team.names, workspace.features)
+    return NextMission(draws, draws)
 
 
 def mean_of(params: Draws | xr.DataTree, workspace: Workspace) -> Draws:
-    """Return the mean of a posterior or of draws."""
-    return draws_of(params, workspace).mean()
+    """Return the mean of a posterior, with expected effects, or of draws."""
+    return draws_of(params, workspace).expected.mean()
 
 
 def mean_and_draws_of(
     params: Draws | xr.DataTree, workspace: Workspace
 ) -> tuple[Draws, Draws | None]:
-    """Return `mean_of` and the draws for bands, or None if there is only a single draw.
-
-    The draws are those of `params_of(next_mission=True)`. A posterior is read only once, so its
-    maps of place effects are drawn only once.
-    """
-    if isinstance(params, xr.DataTree):
-        expected, drawn = expected_and_drawn(params, workspace)
-        return expected.mean(), drawn
-
-    draws = _require_draws(params, workspace)
-    return draws.mean(), draws if draws.n_draws > 1 else None
+    """Return `mean_of` and the draws for bands, or None if there is only a single draw."""
+    expected, drawn = draws_of(params, workspace)
+    return expected.mean(), drawn if drawn.n_draws > 1 else None

@@ -42,7 +42,7 @@ from trustbo.inference.functions.source import OF_PRIOR, FunctionData, OfFunctio
 from trustbo.inference.latent import N_PRIOR
 from trustbo.inference.options import Options
 from trustbo.inference.tree import Fitted, coords_of, default_draws
-from trustbo.models.draws import Draws
+from trustbo.models.draws import Draws, NextMission
 from trustbo.models.observations import Observations
 from trustbo.models.record import effects_to_record
 from trustbo.stacking import require_same_robots
@@ -211,17 +211,19 @@ def prior_draws_of_function(
 
 def prior_draws_of_function_ahead(
     model: FunctionModel, n_draws: int, seed: int, workspace: Workspace
-) -> Draws:
+) -> NextMission:
     """Draw the variables of a function from the prior, with the effects of the first mission."""
     drift = _prior_drift(model, n_draws, seed, workspace)
     effects = model.effects(drift.nothing())
     if not effects:
-        return draws_of_drift(drift)
+        draws = draws_of_drift(drift)
+        return NextMission(draws, draws)
 
     theta = drift.theta()
     parameters = no_weights(theta, workspace.features)
-    ahead = with_prior_effects_ahead(workspace, effects, theta, parameters, seed)
-    return draws_of_drift(drift, effects=ahead)
+    found = with_prior_effects_ahead(workspace, effects, theta, parameters, seed)
+    expected, drawn = (draws_of_drift(drift, effects=one) for one in found)
+    return NextMission(expected, drawn)
 
 
 def _prior_drift(
