@@ -1,0 +1,142 @@
+"""Compare the contact that campaigns lose on all worlds, with that of another version or method.
+
+    python benchmarks/lost.py --data DIR --csv out/lost.csv
+    python benchmarks/lost.py --data DIR --compare benchmarks/reference/lost_0.5.csv
+
+Unlike benchmarks/worlds.py, this script needs no truths: the contact lost is that which the
+missions measured, in bounds per mission, with bounds that failed or were not reached as fully lost.
+Missions have the same seeds in all methods, and each method starts from the same prior.
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from baselines import running_mean
+from common import Table, arguments, parsed
+from groups import GROUPS, KINDS, grounds_of, interval
+from summary import bootstrap
+from world_set import World, worlds
+
+import trustbo as tb
+
+METHODS = {
+    "trustbo": {},
+    "running mean": {"policy": running_mean.greedy(), "model": tb.models.PooledTrust()},
+}
+COURSES = ("sw-ne",)
+MISSIONS = 10
+PLANNER = {"max_bounds": "shortest+4"}
+LABELS = ["world", "kind", "course"]
+
+
+def main() -> None:
+    parser = arguments(__doc__ or "", data=True, quick="three worlds")
+    parser.add_argument("--method", action="append", choices=METHODS, help="default all")
+    parser.add_argument("--course", action="append", help=f"default {', '.join(COURSES)}")
+    parser.add_argument("--csv", type=Path, help="CSV file for the rows")
+    parser.add_argument("--compare", type=Path, help="CSV file with rows of another version")
+    parser.add_argument("--part", default="0/1", help="K/N: every Nth world, beginning with K")
+    given = parsed(parser)
+
+    first, step = map(int, given.part.split("/"))
+    every = [w for w in worlds(given.data).values() if given.data or w.is_packaged]
+    chosen = every[:3] if given.quick else every[first::step]
+    rows = []
+    for world in chosen:
+        for course in given.course or COURSES:
+            rows += rows_of(world, course, given.method or list(METHODS))
+            print(f"{world.name}, {course}", file=sys.stderr, flush=True)
+            if given.csv is not None:
+                given.csv.parent.mkdir(parents=True, exist_ok=True)
+                pd.DataFrame(rows).round(5).to_csv(given.csv, index=False)
+
+    table = pd.DataFrame(rows)
+    report(table)
+    if given.compare is not None:
+        before = pd.read_csv(given.compare)
+        differences(table[table["method"] == "trustbo"], before[before["method"] == "trustbo"])
+
+
+def rows_of(world: World, course: str, methods: Sequence[str]) -> list[dict[str, object]]:
+    """Run one campaign of each method; return the rows."""
+    workspace = world.workspace()
+    simulator = world.simulator(workspace)
+    start, goal = world.ends(course)
+    rows = []
+    for method in methods:
+        options = METHODS[method]
+        result = tb.iterate(
+            workspace,
+            start,
+            goal,
+            n_iterations=MISSIONS,
+            simulator=simulator,
+            seed=4,
+            progress=False,
+            planner=PLANNER,
+            **options,
+        )
+        lost = [lost_in(mission) for mission in result.missions]
+        labels = {"world": world.name, "kind": world.kind, "course": course, "method": method}
+        arrived = np.mean([mission.status == "ok" for mission in result.missions])
+        rows.append(
+            labels | {"lost": np.mean(lost), "lost_last_4": np.mean(lost[-4:]), "arrive": arrived}
+        )
+    return rows
+
+
+def lost_in(mission: tb.Mission) -> float:
+    """Return the contact lost in a mission, in bounds; a bound that is not completed counts 1."""
+    done = np.array(mission.bound_status) == "ok"
+    n_planned = len(mission.path) - 1
+    rates = np.nanmean(mission.contact_rate[done], axis=1)
+    return float(n_planned - rates.sum())
+
+
+def report(rows: pd.DataFrame) -> None:
+    """Print the mean of each method by group and kind, and the paired differences of methods."""
+    table = Table("worlds", "n", *rows["method"].unique(), first=26)
+    for name, kinds in groups().items():
+        some = rows[rows["kind"].isin(kinds)]
+        if len(some):
+            means = some.groupby("method", sort=False)["lost"].mean()
+            table.row(name, some["world"].nunique(), *(f"{x:.3f}" for x in means))
+    print()
+    if rows["method"].nunique() > 1:
+        ours, other = (rows[rows["method"] == name] for name in METHODS)
+        differences(ours, other)
+
+
+def groups() -> dict[str, Sequence[str]]:
+    """Return groups of kinds, and each kind."""
+    return {**GROUPS, **{kind: (kind,) for kind in KINDS}}
+
+
+def differences(ours: pd.DataFrame, other: pd.DataFrame) -> None:
+    """Print the difference in contact lost (negative is better), paired by world and course."""
+    pairs = ours.merge(other, on=LABELS, suffixes=("", "_other"))
+    table = Table("worlds", "n", "ours minus other [95 % by terrain]", "last four", first=26)
+    for name, kinds in groups().items():
+        some = pairs[pairs["kind"].isin(kinds)]
+        if some.empty:
+            continue
+
+        less = pd.DataFrame(
+            {name: some[name] - some[f"{name}_other"] for name in ("lost", "lost_last_4")}
+        )
+        of_worlds = less.groupby(some["world"]).mean()
+        columns = {name: of_worlds[name].to_numpy() for name in of_worlds}
+        found = bootstrap(columns, grounds_of(of_worlds.index), np.mean)
+        ends = (
+            pd.Series({what: found[name, what] for what in ("value", "low", "high")})
+            for name in columns
+        )
+        table.row(name, len(of_worlds), *(interval(one, 3) for one in ends))
+    print()
+
+
+if __name__ == "__main__":
+    main()
