@@ -367,7 +367,8 @@ class TrustModel(Summary, ABC):
         rows = []
         if self.priors.by_feature:
             used -= {"beta", "b"}
-            rows.append(("prior of beta, b", "by the features, see Priors.from_features"))
+            names = "beta, b, f_v" if self.likelihood.gaussian else "beta, b"
+            rows.append((f"prior of {names}", "by the features, see Priors.from_features"))
 
         for name, text in texts.items():
             if name in used:
