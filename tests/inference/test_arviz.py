@@ -41,7 +41,8 @@ def posterior(missions):
 
 def test_sensitivity_flags_a_prior_in_conflict_with_the_data(missions, posterior):
     """The data put the intercept at a half below; the prior says 3 +- .2."""
-    assert set(posterior["log_prior"].data_vars) == {"beta0", "beta", "b", "delta_w", "delta_v"}
+    of_model = {"beta0", "beta", "b", "delta_w", "delta_v", "f_v"}
+    assert set(posterior["log_prior"].data_vars) == of_model
     wrong = PooledTrust(Priors(b=dist.Normal(3.0, 0.2)))
     conflict = tb.fit(missions, wrong, check=False)
     calm = PooledTrust(Priors(b=dist.Normal(0.0, 5.0)))

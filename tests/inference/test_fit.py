@@ -229,8 +229,12 @@ def test_the_prior_mean_is_that_of_prior_draws():
 
 
 def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
-    """Their variances are those of half-normal standard deviations, E tau^2 = scale^2."""
-    effects = (PlaceEffect(0.2, 0.1, 0.15), RobotEffect(0.3, 0.4))
+    """Their variances are those of half-normal standard deviations, E tau^2 = scale^2.
+
+    Those of bounds are multiplied by E[f^2 + (1 - f^2) 4 m (1 - m)], with E f^2 = 1/6 for
+    Beta(1, 2).
+    """
+    effects = (PlaceEffect(0.2, 0.1, 0.15), RobotEffect(0.3, 0.4, tau_lasting=0.2))
     z = np.random.default_rng(1).uniform(size=(3, 8, 4, 5, 2))
     workspace = tb.Workspace.from_awareness(z, features=("traversability", "line_of_sight"))
     draws = sample_prior_ahead(PooledTrust(effects=effects), workspace, 6000, 1).drawn
@@ -238,16 +242,20 @@ def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
     assert draws.place.shape == (6000, 1, 4, 5)
     assert draws.place_bound.shape == (6000, 1, 8, 4, 5)
     assert draws.place.var(0).mean() == pytest.approx(0.2**2, rel=0.1)
-    assert draws.place_bound.var(0).mean() == pytest.approx(0.1**2, rel=0.1)
-    of_robots = draws.place_robot.everywhere()
-    assert of_robots.var(0).mean() == pytest.approx(0.15**2 * 2.0 / 3.0, rel=0.1)
+    m = z[..., 1].mean(0)
+    scale = 1.0 / 6.0 + 5.0 / 6.0 * 4.0 * m * (1.0 - m)
+    ratio = draws.place_bound[:, 0].var(0) / scale
+    assert ratio.mean() == pytest.approx(0.1**2, rel=0.1)
+    assert np.abs(np.corrcoef(ratio.ravel(), scale.ravel())[0, 1]) < 0.4
+    of_robots = draws.place_robot.everywhere().var(0) / scale
+    assert of_robots.mean() == pytest.approx(0.15**2 * 2.0 / 3.0, rel=0.1)
     together = np.mean(draws.place[:, 0, 0, 0] * draws.place[:, 0, 0, 1])
     assert 0.4 * 0.2**2 < together < 0.9 * 0.2**2
 
     # The effect of a robot acts on stationary trust through the weight of line of sight.
     stationary = draws.beta / (1.0 - draws.beta0[..., None])
     own = stationary - stationary.mean(1, keepdims=True)
-    expected = (0.3**2 + 0.4**2) * 2.0 / 3.0  # around the mean of three robots
+    expected = (0.3**2 + 0.4**2 + 0.2**2) * 2.0 / 3.0  # around the mean of three robots
     assert own[..., 1].var(0).mean() == pytest.approx(expected, rel=0.1)
     np.testing.assert_allclose(own[..., 0], 0.0, atol=1e-12)
     again = sample_prior_ahead(PooledTrust(effects=effects), workspace, 6000, 1).drawn

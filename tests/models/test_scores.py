@@ -1,5 +1,6 @@
 """Normal scores of hyperparameters: their prior density, with the Jacobian of the conversion."""
 
+import jax
 import numpy as np
 import numpyro.distributions as dist
 import pytest
@@ -25,7 +26,8 @@ def log_prior_of_values(scores, z):
     values = scores.values(z)
     total = np.zeros(len(z))
     for name, prior in scores.priors.items():
-        total += np.asarray(prior.log_prob(values[name]))
+        with jax.enable_x64(True):
+            total += np.asarray(prior.log_prob(values[name]))
 
     def stacked(z):
         return np.stack([scores.values(z)[name] for name in scores.priors], axis=1)
