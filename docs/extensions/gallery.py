@@ -114,9 +114,10 @@ def figures() -> Iterator[Figure]:
     yield Figure(
         "arviz.plot_ppc_dist", predictions,
         "Posterior predictive check: measured contact rates (black) and predicted ones. The "
-        "default Gaussian family fails this check: rates of exactly 1 are more frequent than it "
-        "predicts, and predictions exceed 1. Plans need the mean of trust only. To predict single "
-        'rates, use the family "censored".',
+        "default Gaussian family fails this check: 60 % of the measured rates are 1, of its "
+        "predictions 48 % are 1 or more, and predictions exceed 1. The mean, the spread and the "
+        "smallest rate agree. Plans need the mean of trust only. To predict single rates, use the "
+        'family "censored" with the same effects, which predicts that 62 % are 1.',
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.explore",

@@ -26,7 +26,7 @@ def log_prior_of_values(scores, z):
     values = scores.values(z)
     total = np.zeros(len(z))
     for name, prior in scores.priors.items():
-        with jax.enable_x64(True):
+        with jax.enable_x64(True), jax.numpy_rank_promotion("allow"):
             total += np.asarray(prior.log_prob(values[name]))
 
     def stacked(z):
