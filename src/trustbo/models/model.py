@@ -366,8 +366,8 @@ class TrustModel(Summary, ABC):
 
         rows = []
         if self.priors.by_feature:
-            used -= {"beta", "b"}
-            names = "beta, b, f_v" if self.likelihood.gaussian else "beta, b"
+            used -= {"beta0", "beta", "b"}
+            names = "beta0, beta, b" + ", f_v" * self.likelihood.gaussian
             rows.append((f"prior of {names}", "by the features, see Priors.from_features"))
 
         for name, text in texts.items():

@@ -31,6 +31,9 @@ from trustbo.models.scores import log_density
 _SIGHT_SD = 0.3
 _FEATURE_SD = 0.25
 _INTERCEPT_SD = 0.15
+_MEMORY = (2.0, 6.0)
+"""Parameters of the Beta prior on beta0 with line of sight. With more weight near 1, constant
+contact in a first mission would be explained by trust that never changes."""
 _FLOOR = (1.0, 2.0)
 """Parameters of the Beta prior on the floor of the scale of noise."""
 _MIDDLE = 0.5
@@ -160,7 +163,8 @@ class Priors(Summary):
         The feature `line_of_sight` predicts the contact rate. Stationary trust therefore has prior
         slope 1 in this feature, or in the mean of n such features (`line_of_sight_1`, ...). Divided
         by 1 - beta0, the weights of these features have the prior N(1 / n, 0.3^2 / n), other
-        weights have N(0, 0.25^2), and the intercept has N(0, 0.15^2). Most rates drawn from these
+        weights have N(0, 0.25^2), and the intercept has N(0, 0.15^2). Line of sight explains trust
+        without much memory, so beta0 ~ Beta(2, 6). Most rates drawn from these
         priors are in [0, 1]. The floor of the noise has the prior f_v ~ Beta(1, 2) for Gaussian
         rates. For tick counts, the priors are scaled by 5, and a line of sight of
         0.5 predicts a rate of 0.5. If there is no such feature, the priors are those of `default`.
@@ -180,6 +184,7 @@ class Priors(Summary):
             sd = np.where(is_sight, _SIGHT_SD / np.sqrt(n), _FEATURE_SD)
             return replace(
                 default,
+                beta0=_built(dist.Beta, *_MEMORY),
                 beta=dist.Normal(slope * is_sight / n, slope * sd),
                 b=dist.Normal(-slope * zero, slope * _INTERCEPT_SD),
                 f_v=_built(dist.Beta, *_FLOOR) if FAMILIES[family].gaussian else None,
