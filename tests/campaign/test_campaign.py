@@ -39,6 +39,7 @@ def refuse(*args, **kwargs):
     raise tb.PosteriorError("R-hat of beta0 is 1.5.")
 
 
+@pytest.mark.filterwarnings("ignore:the refit without mission")  # of so few missions
 def test_floating_point_errors_of_users_are_not_raised_by_the_library():
     workspace = tb.Workspace.from_terrain(hillside(), (3, 3))
     robots = tb.simulation.KinematicSimulator(workspace)
