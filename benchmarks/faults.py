@@ -116,7 +116,7 @@ FAULTS = (
           "name: dist.HalfNormal(getattr(self, name))",
           "name: dist.HalfNormal(2.0 * getattr(self, name))"),
     Fault("a rate that was not measured counts as 0", "inference/engine.py",
-          "~np.isnan(y)])", "np.ones(np.shape(y), dtype=bool)])"),
+          "seen = ~np.isnan(y)", "seen = np.ones(np.shape(y), dtype=bool)"),
     Fault("frames are rotated the other way", "export/nav2.py",
           "np.array([[c, -s], [s, c]])", "np.array([[c, s], [-s, c]])"),
 )  # fmt: skip

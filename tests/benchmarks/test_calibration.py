@@ -77,7 +77,10 @@ def test_a_small_world_is_measured_and_reported(calibration, monkeypatch, tmp_pa
     world = replace(worlds()["synthetic-1-one-poor"], shape=(4, 4), cell=40.0)
     courses = ["sw-ne"]
     calibration.store_paths([world], courses)
-    models = {"default": tb.models.default_model(), "pooled": tb.models.PooledTrust()}
+    models = {
+        "default": lambda features: tb.models.default_model(),
+        "pooled": lambda features: tb.models.PooledTrust(),
+    }
     rows = calibration.measure([world], courses, models, tmp_path / "out")
     assert set(rows["model"]) == set(models)
     assert set(rows["set"]) == {"driven", "undriven", calibration.FIRST}

@@ -40,6 +40,7 @@ def refuse(*args, **kwargs):
 
 
 @pytest.mark.filterwarnings("ignore:the refit without mission")  # of so few missions
+@pytest.mark.filterwarnings("ignore:Estimated shape parameter")
 def test_floating_point_errors_of_users_are_not_raised_by_the_library():
     workspace = tb.Workspace.from_terrain(hillside(), (3, 3))
     robots = tb.simulation.KinematicSimulator(workspace)

@@ -201,11 +201,12 @@ def test_trust_of_the_next_mission_has_the_variance_of_the_next_effects(with_rob
 
     # The variance of the next effect, given those of the n missions before, for each draw.
     theta = posterior["posterior"].to_dataset().squeeze("chain")
+    lasting = theta["tau_lasting"].values[:, None, None] ** 2
     slow = theta["tau_slow"].values[:, None, None] ** 2
     day = theta["tau_mission"].values[:, None, None] ** 2
     n = posterior.attrs["n_missions"]
     lag = np.abs(np.subtract.outer(np.arange(n + 1), np.arange(n + 1)))
-    cov = slow * 0.9**lag + day * np.eye(n + 1)
+    cov = lasting + slow * 0.9**lag + day * np.eye(n + 1)
     known, ahead = cov[:, :n, :n], cov[:, :n, n]
     explained = np.linalg.solve(known, ahead[..., None])[..., 0]
     variance = cov[:, n, n] - (explained * ahead).sum(1)
