@@ -63,7 +63,7 @@ def filter_of(campaign):
     """Filter of the campaign's posterior, or of its prior."""
     if campaign.state.last is not None:
         return TrustFilter(campaign.posterior)
-    model = campaign.model
+    model = campaign.model.for_features(campaign.workspace.features)
     seed = campaign.state.seed_of("prior")
     draws = sample_prior_ahead(model, campaign.workspace, 250, seed).drawn
     return TrustFilter(draws, 3, family=model.family, workspace=campaign.workspace)
