@@ -148,10 +148,10 @@ def test_trust_before_anything_is_learned_is_that_of_the_prior(workspace):
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
     # No feature predicts line of sight, so drawn effects have the variance tau_slow^2 +
-    # tau_mission^2, whose expected value is twice the squared scale of the half-normal priors.
+    # tau_mission^2 + tau_lasting^2, whose expected value is that of the squared prior scales.
     added = (trust - found).values
     assert abs(added.mean()) < 4.0 * added.std() / np.sqrt(len(added))
-    np.testing.assert_allclose(added.std(), np.sqrt(2.0) * 0.2, rtol=0.3)
+    np.testing.assert_allclose(added.std(), np.sqrt(2.0 * 0.2**2 + 0.3**2), rtol=0.3)
 
     # Maps have the largest trust of many paths, and so no effects of unknown places.
     of_prior = campaign.planner.maps(campaign.draw_prior(20))
