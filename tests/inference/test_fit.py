@@ -232,7 +232,7 @@ def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
     """Their variances are those of half-normal standard deviations, E tau^2 = scale^2.
 
     Those of bounds are multiplied by E[f^2 + (1 - f^2) 4 m (1 - m)], with E f^2 = 1/6 for
-    Beta(1, 2).
+    Beta(1, 2). Of the effects on the team, 5 % are half-normal with scale 3 tau instead.
     """
     effects = (PlaceEffect(0.2, 0.1, 0.15), RobotEffect(0.3, 0.4, tau_lasting=0.2))
     z = np.random.default_rng(1).uniform(size=(3, 8, 4, 5, 2))
@@ -244,8 +244,10 @@ def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
     assert draws.place.var(0).mean() == pytest.approx(0.2**2, rel=0.1)
     m = z[..., 1].mean(0)
     scale = 1.0 / 6.0 + 5.0 / 6.0 * 4.0 * m * (1.0 - m)
-    ratio = draws.place_bound[:, 0].var(0) / scale
-    assert ratio.mean() == pytest.approx(0.1**2, rel=0.1)
+    mean = 0.05 * 3.0 * 2.0 / np.pi * 0.1  # E tau is tau's scale times sqrt(2 / pi), like E |n|
+    of_team = 0.1**2 * (0.95 * scale + 0.05 * 9.0) - mean**2
+    ratio = draws.place_bound[:, 0].var(0) / of_team
+    assert ratio.mean() == pytest.approx(1.0, rel=0.1)
     assert np.abs(np.corrcoef(ratio.ravel(), scale.ravel())[0, 1]) < 0.4
     of_robots = draws.place_robot.everywhere().var(0) / scale
     assert of_robots.mean() == pytest.approx(0.15**2 * 2.0 / 3.0, rel=0.1)

@@ -4,7 +4,11 @@ Effects s of unvisited cells are drawn by Matheron's rule: a prior draw over the
 corrected by kriging at the visited cells. Prior draws use the fast Fourier transform of a circulant
 covariance on a torus (Dietrich and Newsam 1997). The torus is so large that correlations around it
 are nearly 0. Length scales are rounded to steps of 10 %, which changes the correlation of
-neighbouring cells by less than 0.01. Effects e of unvisited bounds are drawn from the prior.
+neighbouring cells by less than 0.01.
+
+Effects e of unvisited bounds are drawn from the prior, except for a small share. Maps are simply
+wrong about a few bounds, even where they predict no contact or whole contact. The fit cannot learn
+this from the bounds that were visited, because its prior is Gaussian.
 
 The random part of the draws is centred at 0. Therefore, the mean map is the posterior mean of the
 effects, without Monte Carlo error in places that were not visited.
@@ -34,6 +38,10 @@ _REACH = 5.0
 """Distance in length scales at which the correlation is 0.002."""
 _JITTER = 1e-9
 """Added to the correlation matrix of visited cells."""
+_SHARE_WRONG = 0.05
+"""Share of the draws of e in which the map is wrong about a bound."""
+_SD_WRONG = 3.0
+"""Scale of the half-normal size of e in these draws, in units of tau_e."""
 _FIRST_SEED = 1000
 """Seed of the length scale 1. Steps of the scale can be negative, but seeds cannot."""
 _CELL = ("row", "col")
@@ -84,7 +92,7 @@ def place_maps_of(
         group: Posterior group `places`.
         parameters: Hyperparameters (draw,) by name, with chains joined.
         workspace: Workspace that predicts line of sight; without it, the scale of effects in bounds
-            that were not visited is 1.
+            that were not visited is 1, and the map is not wrong about any of them.
 
     Returns:
         Arrays place (draw, effect, row, col) and place_bound (draw, effect, move, row, col). The
@@ -100,10 +108,7 @@ def place_maps_of(
     place = _cells(s, cells, (rows, cols), parameters, [seed, 0])
 
     # Effects of bounds are independent, so only those of visited bounds are replaced.
-    rng = np.random.default_rng([seed, 1])
-    place_bound = rng.standard_normal((len(place), len(MOVE_NAMES), rows, cols))
-    place_bound *= parameters["tau_e"][:, None, None, None]
-    place_bound *= scale_at(_variation(group, workspace), _floor(parameters)[:, None, None, None])
+    place_bound = _of_bounds(parameters, _sight(group, workspace), np.random.default_rng([seed, 1]))
     _centre(place_bound)
     place_bound[:, *_bounds(group)] = joined_draws(group["place_bound"], ["bound"])
     return {"place": place[:, None], "place_bound": place_bound[:, None]}
@@ -140,7 +145,7 @@ def robots_in_bounds_of(
         column=column,
         tau_r=tau_r,
         floor=_floor(parameters),
-        variation=_variation(group, workspace),
+        variation=variation(_sight(group, workspace)),
         number=np.arange(len(tau_r)),
         seed=seed,
     )
@@ -151,18 +156,43 @@ def _floor(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
     return parameters.get("f_e", np.ones(len(parameters["tau_e"])))
 
 
-def _variation(group: xr.Dataset, workspace: Workspace | None) -> np.ndarray:
-    """Return `variation` of the robots' mean line of sight, shape (move, row, col).
+def _sight(group: xr.Dataset, workspace: Workspace | None) -> np.ndarray:
+    """Return the mean line of sight of the robots, shape (move, row, col).
 
-    It is 1 where line of sight is not predicted.
+    It is 0.5, where the scale is 1, if line of sight is not predicted.
     """
     rows, cols = (int(n) for n in group.attrs["shape"])
     sight = [] if workspace is None else [*filter(is_line_of_sight, workspace.features)]
     if workspace is None or not sight:
-        return np.ones((len(MOVE_NAMES), rows, cols))
+        return np.full((len(MOVE_NAMES), rows, cols), 0.5)
 
     mean = workspace.awareness.sel(feature=sight).mean(("robot", "feature"), skipna=False)
-    return np.nan_to_num(variation(mean.values), nan=1.0)
+    return np.nan_to_num(mean.values, nan=0.5)
+
+
+def _of_bounds(
+    parameters: Mapping[str, np.ndarray], sight: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw effects e (draw, move, row, col) of unvisited bounds, given the mean line of sight.
+
+    They are normal with standard deviation g tau_e for the scale g. A small share of them, for
+    which the map is wrong, are half-normal with scale 3 tau_e, and positive if the line of sight is
+    below 0.5, otherwise negative. In models without the scale, all are normal.
+    """
+    tau_e, floor = (x[:, None, None, None] for x in (parameters["tau_e"], _floor(parameters)))
+    e = rng.standard_normal((len(tau_e), *sight.shape))
+    scale = scale_at(variation(sight), floor)
+
+    if "f_e" in parameters:
+        to_middle = 0.5 - sight  # 0 where line of sight is not predicted
+        share = np.where(to_middle == 0.0, 0.0, _SHARE_WRONG)
+        is_wrong = rng.random(e.shape, dtype=np.float32) < share
+        scale[is_wrong] = _SD_WRONG
+        np.copysign(e, to_middle, out=e, where=is_wrong)
+
+    e *= scale
+    e *= tau_e
+    return e
 
 
 def in_order_of_places(group: xr.Dataset) -> xr.Dataset:

@@ -47,6 +47,10 @@ class PlaceEffect(Effect):
     The floor f_e is g where m is 0 or 1. Without a feature that predicts line of sight, and if
     trust is a logit, f_e is 1, so that all bounds have the same scale.
 
+    The map is simply wrong about a few bounds. If f_e is not fixed, 5 % of the draws of e in a
+    bound that was never driven are therefore half-normal with scale 3 tau_e, and move trust towards
+    0.5. The draws are shifted so that their mean remains 0. Fits and planned paths do not change.
+
     The errors of awareness differ between robots, and they are the same each time that the robots
     drive a bound. Without r_i, these errors would look like independent noise, and bounds that the
     robots drive repeatedly would seem to be strong evidence for wrong weights. Plans leave out r_i,
