@@ -186,3 +186,35 @@ def test_rates_and_parameters_must_have_the_shape_of_the_drift():
     for beta0 in (0.5, np.eye(3)):
         with pytest.raises(TrustboError, match="delta_s"):
             ContactRate(rates, beta0, 0.1, 0.1, delta_s=np.full(3, 0.1))
+
+
+def test_noise_scale_multiplies_each_rates_own_noise():
+    """Against the joint normal of a mission's rates, with one factor for each rate."""
+    scale = np.random.default_rng(3).uniform(0.1, 1.5, DRIFT.shape)
+    given = {"beta0": 0.6, "delta_w": 0.2, "delta_v": 0.1}
+    y = np.random.default_rng(4).uniform(size=DRIFT.shape)
+    with own_settings():
+        scaled = ContactRate(DRIFT, **given, noise_scale=scale)
+        found = np.asarray(scaled.log_prob(y))
+        drawn = np.asarray(scaled.sample(jax.random.key(0), (20_000,)))
+
+    n = DRIFT.shape[1]
+    lag = np.subtract.outer(np.arange(n), np.arange(n))
+    T = np.where(lag >= 0, 0.6 ** np.maximum(lag, 0), 0.0)
+    of_start = 0.6 ** np.arange(1.0, n + 1.0)
+    cov = 0.2**2 * T @ T.T + 0.5**2 * np.outer(of_start, of_start)
+    expected = np.zeros(len(DRIFT))
+    for j, robot in product(range(len(DRIFT)), range(N_ROBOTS)):
+        mean = T @ DRIFT[j, :, robot] + 0.5 * of_start
+        total = cov + np.diag((0.1 * scale[j, :, robot]) ** 2)
+        expected[j] += multivariate_normal.logpdf(y[j, :, robot], mean, total)
+        sd = drawn[:, j, :, robot].std(0)
+        np.testing.assert_allclose(sd, np.sqrt(np.diag(total)), rtol=0.03)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_noise_scale_needs_noise_that_is_no_matrix_and_the_shape_of_the_drift():
+    with pytest.raises(TrustboError, match="noise_scale cannot be combined"):
+        ContactRate(DRIFT, 0.5, 0.1, SHAPES["matrix"]["delta_v"], noise_scale=0.5)
+    with pytest.raises(TrustboError, match="noise_scale must have the shape"):
+        ContactRate(DRIFT, 0.5, 0.1, 0.1, noise_scale=np.ones(N_ROBOTS))

@@ -144,3 +144,27 @@ def test_the_description_tells_kinds_of_memory_apart(workspace):
     level, deviation = (simulator.describe()["truth"] for simulator in simulators)
     assert level != deviation
     assert TrustParams(**deviation).memory == "deviation"
+
+
+def test_noise_is_scaled_by_the_mean_line_of_sight_of_the_team():
+    """Filters that predict the rates expect the same noise."""
+    z = np.full((3, 1, 4, 1), 0.5)
+    z[:, 0, 2] = 1.0
+    z[:, 0, 3, 0] = 0.7, 0.9, 0.8  # mean 0.8
+    features = ["line_of_sight"]
+    workspace = tb.Workspace.from_awareness(z, features=features)
+    params = TrustParams(0.0, np.zeros(1), 0.5, 1e-9, 0.04, x0_sd=0.0, f_v=0.3, features=features)
+    simulator = ModelSimulator(workspace, params)
+    rates = np.stack([simulator.run(ROW, seed=seed).contact_rate for seed in range(1500)])
+    g = np.sqrt(0.3**2 + (1.0 - 0.3**2) * 4.0 * np.array([0.25, 0.0, 0.16]))
+    np.testing.assert_allclose(rates.std(0), 0.04 * g[:, None] * np.ones(3), rtol=0.1)
+
+    trust = tb.inference.TrustFilter(params.draw(np.zeros(4000, int)), 3, max_draws=4000)
+    ahead = trust.predict(workspace.along(ROW), ROW)
+    np.testing.assert_allclose(ahead.draws.std(0), 0.04 * g[:, None] * np.ones(3), rtol=0.05)
+
+
+def test_scaled_noise_needs_a_feature_of_line_of_sight(workspace):
+    params = TrustParams(0.6, np.array([0.3, 0.2]), 0.05, 0.05, 0.05, f_v=0.3)
+    with pytest.raises(TrustboError, match="f_v needs the names of the features"):
+        ModelSimulator(workspace, params).run(ROW, seed=0)
