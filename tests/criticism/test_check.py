@@ -99,7 +99,7 @@ def test_a_robot_that_is_poor_on_the_only_path_stands_out():
     posterior = tb.fit(missions, MODEL, progress=False)
 
     effect = posterior["robots"]["robot_effect"].mean(("chain", "draw")).sel(robot="r2")
-    assert abs(float(effect.mean())) < 0.1  # not an effect of the robot alone
+    assert abs(float(effect.mean())) < 0.15  # of a mean loss of 0.175: not of the robot alone
     assert tb.check(posterior).table.loc["robots", "label"] == "r2"
     assert tb.check(posterior).table.loc["robots", "stands_out"]
 
