@@ -131,17 +131,35 @@ class Mission(NamedTuple):
         return mean, cov + self.rate_cov - self.trust_cov
 
 
-def mission_of(form, drift, offset):
-    """Joint normal of a mission for inputs (..., bound, robot)."""
+def mission_of(form, drift, offset, scale=None):
+    """Joint normal of a mission for inputs (..., bound, robot), and for a scale of the noise."""
     n_bounds = drift.shape[-2]
     mean = expected_trust(form, drift, offset)
     cov = trust_covariance(form, n_bounds)
-    return Mission(mean.reshape(*mean.shape[:-2], -1), cov, cov + rate_noise(form, n_bounds))
+    noise = rate_noise(form, n_bounds)
+    if scale is not None:
+        g = scale.reshape(*scale.shape[:-2], -1)
+        noise = noise * g[..., :, None] * g[..., None, :]
+    return Mission(mean.reshape(*mean.shape[:-2], -1), cov, cov + noise)
+
+
+def noise_scale_of(params, awareness):
+    """Scale (draw, bound, robot) of the noise by the team's mean line of sight; None without."""
+    if "f_v" not in params.values:
+        return None
+    sight = [m for m, name in enumerate(params.features) if name.startswith("line_of_sight")]
+    m = awareness[..., sight].mean((1, 2))
+    f = np.asarray(params.f_v)[:, None]
+    g = np.sqrt(f**2 + (1.0 - f**2) * 4.0 * m * (1.0 - m))
+    return g[:, :, None] * np.ones(awareness.shape[1])
 
 
 def mission_of_params(params, awareness, path=None, *, x0=None):
     """Joint normal of a mission under draws of parameters; see `equations_of_params`."""
-    return mission_of(*equations_of_params(params, awareness, path, x0=x0))
+    scale = noise_scale_of(params, awareness)
+    if scale is not None and params.n_draws == 1:
+        scale = scale[0]
+    return mission_of(*equations_of_params(params, awareness, path, x0=x0), scale)
 
 
 def trust_of_params(params, awareness, path=None, *, x0=None):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import numpyro.distributions as dist
 import pytest
-from dense_statespace import equations_of_params, mission_of, mission_of_params
+from dense_statespace import equations_of_params, mission_of, mission_of_params, noise_scale_of
 from missions import draw_rates
 from scipy import stats
 
@@ -42,9 +42,14 @@ def without_memory(model):
     return replace(model, priors=replace(model.priors, beta0=dist.Beta(1.0, 1e6)))
 
 
+def with_equal_noise(model):
+    """The model whose noise is the same in all bounds."""
+    return replace(model, priors=replace(model.priors, f_v=None))
+
+
 def test_the_evidence_without_memory_is_that_of_quadrature():
     """Over both noises, half-normal a priori."""
-    model = without_memory(PooledTrust())
+    model = with_equal_noise(without_memory(PooledTrust()))
     posterior = Density(model, model.observations(missions_with(0.3, 1)))
     found = by_importance(posterior, 1000, 0)[2]["log_evidence"]
 
@@ -109,7 +114,8 @@ def test_likelihoods_are_those_of_a_chain_of_deviations(deviations):
     for j, mission in enumerate(deviations):
         form, drift, offset = equations_of_params(of_draw, mission.awareness, mission.path)
         offset = offset + d[j] * mission.awareness[..., 0]
-        expected = mission_of(form, drift, offset).log_density(mission.contact_rate)
+        scale = noise_scale_of(of_draw, mission.awareness)[0]
+        expected = mission_of(form, drift, offset, scale).log_density(mission.contact_rate)
         found = posterior["log_likelihood"]["contact_rate"].values[0, 7, j]
         # Effects of robots in bounds are stored in single precision.
         np.testing.assert_allclose(found, expected, rtol=1e-8)
