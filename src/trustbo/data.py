@@ -476,6 +476,11 @@ def is_line_of_sight(feature: str) -> bool:
     return feature.startswith(LINE_OF_SIGHT)
 
 
+def sight_columns(features: Sequence[str]) -> list[int]:
+    """Return the indices of the features that are predicted contact rates."""
+    return [m for m, name in enumerate(features) if is_line_of_sight(name)]
+
+
 def default_features(n_features: int) -> tuple[str, ...]:
     """Return default names of features: traversability, visibility, z3, z4, ..."""
     return (*FEATURES, *(f"z{m + 1}" for m in range(2, n_features)))[:n_features]

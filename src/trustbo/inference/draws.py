@@ -10,7 +10,7 @@ import pandas as pd
 import xarray as xr
 
 from trustbo.arrays import in_order, joined_draws
-from trustbo.data import Mission, is_line_of_sight
+from trustbo.data import Mission, sight_columns
 from trustbo.errors import TrustboError, require_count, require_kind, require_whole
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.functions.data import require_same_order
@@ -270,7 +270,7 @@ class _Ahead(NamedTuple):
         slope = np.broadcast_to(sum(slopes), shape)
 
         # Robot effects act on line of sight, or on the intercept if it is not among the features.
-        sight = [m for m, name in enumerate(self.features) if is_line_of_sight(name)]
+        sight = sight_columns(self.features)
         weights = np.zeros((*shape, len(self.features)))
         if sight:
             weights[:, :, sight] = slope[..., None] / len(sight)

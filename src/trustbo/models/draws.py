@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 
 from trustbo.arrays import Names
-from trustbo.data import is_line_of_sight
+from trustbo.data import sight_columns
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.models.robots_in_bounds import RobotsInBounds
@@ -321,7 +321,7 @@ class Draws(Summary):
         if "f_v" not in self.arrays:
             return 1.0
 
-        sight = [m for m, name in enumerate(self.features or ()) if is_line_of_sight(name)]
+        sight = sight_columns(self.features or ())
         if not sight:
             raise TrustboError(
                 "f_v needs the names of the features, of which one is line_of_sight; got "

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from trustbo.data import Mission, is_line_of_sight
+from trustbo.data import Mission, sight_columns
 from trustbo.errors import TrustboError
 from trustbo.models.families import Family
 from trustbo.models.visited import Visited
@@ -77,7 +77,7 @@ class Observations(NamedTuple):
     @property
     def line_of_sight(self) -> np.ndarray:
         """Mean (mission, bound, robot) of the line-of-sight features, or 1 if there are none."""
-        sight = [m for m, name in enumerate(self.features) if is_line_of_sight(name)]
+        sight = sight_columns(self.features)
         if not sight:
             return np.ones(self.contact_rate.shape)
         return self.awareness[..., sight].mean(-1)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.linalg import helmert, lapack
 
-from trustbo.data import Mission, is_line_of_sight
+from trustbo.data import Mission, sight_columns
 from trustbo.errors import require_positive
 from trustbo.models.backend import own_settings
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
@@ -97,7 +97,7 @@ class PlaceEffect(Effect):
 
     def for_features(self, features: Sequence[str], *, of_rates: bool) -> Self:
         """See `Effect.for_features`; the floor is 1 where nothing predicts the rate."""
-        if of_rates and any(is_line_of_sight(name) for name in features):
+        if of_rates and sight_columns(features):
             return self
         return replace(self, f_e=0.0)
 
