@@ -2,8 +2,8 @@
 
     python benchmarks/fuzz_plans.py [-n N] [--first I] [--seed S] [--networkx] [--quick]
 
-The problems vary the grid (holes, closed bounds), the awareness (of cells or bounds), place
-effects, the model (equal, different or coupled robots), the objective, the family, costs of bounds,
+The problems vary the grid (holes, closed bounds), the awareness (of cells or bounds), the number of
+sets of posts, place effects, the model (equal, different or coupled robots), the objective, the family, costs of bounds,
 limits on the number of bounds, U-turns, and risks (limits, costs, components). Numbers are usual,
 large, tied or 0. The plan must have the best score of all admissible paths, which
 `peers.every_path` enumerates without code of the planner. With --networkx, the plan must also have
@@ -24,6 +24,7 @@ from trustbo.models import TrustParams
 from trustbo.models.params import CoupledParams, RobotParams
 from trustbo.planning import InfeasibleError, Planner
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import posts_along
 
 OBJECTIVES, FAMILIES = (
     ("lost_contact", "terminal", "mean"),
@@ -145,12 +146,17 @@ def draw_problem(rng):
     passable, closed, into, start, goal = draw_grid(rng)
     shape, n = passable.shape, pick(rng, 1, 2, 3)
     z = rng.random((n, *(() if rng.random() < 0.3 else (8,)), *shape, 2))
+    of_posts = rng.spawn(1)[0]  # does not change the numbers of other problems
+    n_posts = pick(of_posts, 1, 1, 2, 3) if z.ndim == 5 else 1
+    if n_posts > 1:
+        others = of_posts.random((n, 8 * (n_posts - 1), *shape, 2))
+        z = np.concatenate([z, np.round(others * 4.0) / 4.0], axis=1)
     by_bound = z if z.ndim == 5 else np.repeat(z[:, None], 8, axis=1)
     objective, family = pick(rng, *OBJECTIVES), pick(rng, *FAMILIES)
     params, u, B0, x0, sd = draw_model(
         rng, by_bound, pick(rng, "usual", "usual", "large", "tied", "zeros")
     )
-    u = u.reshape(len(u), 8, -1)
+    u = u.reshape(len(u), 8 * n_posts, -1)
     if objective == "lost_contact" and family == "gaussian":  # no bound gains contact
         u, x0 = np.minimum(u, 1.0 - B0.sum(1)[:, None, None]), np.minimum(x0, 1.0)
     ends = [int(np.ravel_multi_index(cell, shape)) for cell in (start, goal)]
@@ -177,7 +183,7 @@ def draw_problem(rng):
         failure = cost * share
     limit = options.get("max_failure", np.inf)
     return planner, params, World(
-        objective, *ends, into, bound_cost.reshape(8, -1), u, B0, x0, family, sd, shortest + extra,
+        objective, *ends, np.tile(into, (n_posts, 1)), bound_cost.reshape(8, -1), u, B0, x0, family, sd, shortest + extra,
         turns, risk, failure, share, limit,
     )  # fmt: skip
 
@@ -189,7 +195,10 @@ def faults(planner, params, world, best):
     except InfeasibleError as error:
         return ["refused"] if best > -np.inf else [], error.path is not None
     scale = max(1.0, abs(best))
-    flat = [int(np.ravel_multi_index(cell, planner.workspace.grid.shape)) for cell in plan.path]
+    shape = planner.workspace.grid.shape
+    posts = [*posts_along(plan.path), 0]
+    cells = (int(np.ravel_multi_index(cell[:2], shape)) for cell in plan.path)
+    flat = [*zip(cells, posts, strict=True)]
     score, wrong = score_along(world, flat), []
     if plan.exact and score < best - 1e-9 * scale:
         wrong.append(f"score {score:.12g}, best {best:.12g}")
@@ -227,7 +236,8 @@ def main():
         most = 2000 if given.networkx else _MOST_WALKS
         planner, params, world, best = problem_of(given.seed, index, most)
         wrong, exact = faults(planner, params, world, best)
-        if given.networkx and not wrong and best > -np.inf:
+        is_peers = planner.workspace.n_posts == 1
+        if given.networkx and is_peers and not wrong and best > -np.inf:
             ours, theirs = planner.plan(params), networkx_planner.plan(planner, params)
             if abs(ours.value - theirs.value) > 1e-9 * max(1.0, abs(theirs.value)):
                 wrong.append(f"value {ours.value:.12g}, networkx {theirs.value:.12g}")
@@ -235,6 +245,7 @@ def main():
             problems=1, wrong=len(wrong) > 0, infeasible=int(best == -np.inf), inexact=not exact
         )
         outcome[world.objective, world.family] += 1
+        outcome["with sets of posts"] += not is_peers
         for what in wrong:
             print(f"WRONG {index}: {what}", flush=True)
     print(", ".join(f"{count} {name}" for name, count in outcome.items() if isinstance(name, str)))

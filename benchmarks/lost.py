@@ -11,6 +11,7 @@ Missions have the same seeds in all methods, and each method starts from the sam
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,19 +23,30 @@ from world_set import World, worlds
 
 import trustbo as tb
 
-METHODS = {
+METHODS: dict[str, dict[str, Any]] = {
     "trustbo": {},
     "running mean": {"policy": running_mean.greedy(), "model": tb.models.PooledTrust()},
+    "2 sets of posts": {"n_posts": 2},
+    "3 sets of posts": {"n_posts": 3},
+    "4 sets of posts": {"n_posts": 4},
 }
+"""Arguments of `trustbo.iterate`, and `n_posts` of the workspace, keyed by method."""
+USUAL = ("trustbo", "running mean")
+"""Methods that are compared if none is given; the first is the one that others are compared to."""
 COURSES = ("sw-ne",)
 MISSIONS = 10
 PLANNER = {"max_bounds": "shortest+4"}
 LABELS = ["world", "kind", "course"]
+LEAST = 0.02
+"""Contact lost, in bounds, that is added to both sides of a ratio; on some worlds none is lost."""
 
 
 def main() -> None:
     parser = arguments(__doc__ or "", data=True, quick="three worlds")
-    parser.add_argument("--method", action="append", choices=METHODS, help="default all")
+    parser.add_argument(
+        "--method", action="append", choices=METHODS, help=f"default {', '.join(USUAL)}"
+    )
+    parser.add_argument("--missions", type=int, default=MISSIONS, help=f"default {MISSIONS}")
     parser.add_argument("--course", action="append", help=f"default {', '.join(COURSES)}")
     parser.add_argument("--csv", type=Path, help="CSV file for the rows")
     parser.add_argument("--compare", type=Path, help="CSV file with rows of another version")
@@ -47,7 +59,7 @@ def main() -> None:
     rows = []
     for world in chosen:
         for course in given.course or COURSES:
-            rows += rows_of(world, course, given.method or list(METHODS))
+            rows += rows_of(world, course, given.method or USUAL, given.missions)
             print(f"{world.name}, {course}", file=sys.stderr, flush=True)
             if given.csv is not None:
                 given.csv.parent.mkdir(parents=True, exist_ok=True)
@@ -60,19 +72,21 @@ def main() -> None:
         differences(table[table["method"] == "trustbo"], before[before["method"] == "trustbo"])
 
 
-def rows_of(world: World, course: str, methods: Sequence[str]) -> list[dict[str, object]]:
+def rows_of(
+    world: World, course: str, methods: Sequence[str], n_missions: int
+) -> list[dict[str, object]]:
     """Run one campaign of each method; return the rows."""
-    workspace = world.workspace()
-    simulator = world.simulator(workspace)
     start, goal = world.ends(course)
     rows = []
     for method in methods:
-        options = METHODS[method]
+        options = dict(METHODS[method])
+        workspace = world.workspace(n_posts=options.pop("n_posts", 1))
+        simulator = world.simulator(workspace)
         result = tb.iterate(
             workspace,
             start,
             goal,
-            n_iterations=MISSIONS,
+            n_iterations=n_missions,
             simulator=simulator,
             seed=4,
             progress=False,
@@ -82,9 +96,8 @@ def rows_of(world: World, course: str, methods: Sequence[str]) -> list[dict[str,
         lost = [lost_in(mission) for mission in result.missions]
         labels = {"world": world.name, "kind": world.kind, "course": course, "method": method}
         arrived = np.mean([mission.status == "ok" for mission in result.missions])
-        rows.append(
-            labels | {"lost": np.mean(lost), "lost_last_4": np.mean(lost[-4:]), "arrive": arrived}
-        )
+        means = {"first": lost[0], "lost": np.mean(lost), "lost_last_4": np.mean(lost[-4:])}
+        rows.append(labels | means | {"arrive": arrived})
     return rows
 
 
@@ -105,9 +118,10 @@ def report(rows: pd.DataFrame) -> None:
             means = some.groupby("method", sort=False)["lost"].mean()
             table.row(name, some["world"].nunique(), *(f"{x:.3f}" for x in means))
     print()
-    if rows["method"].nunique() > 1:
-        ours, other = (rows[rows["method"] == name] for name in METHODS)
-        differences(ours, other)
+    first, *others = rows["method"].unique()
+    for name in others:
+        print(f"{name} (ours) and {first} (other)")
+        differences(rows[rows["method"] == name], rows[rows["method"] == first])
 
 
 def groups() -> dict[str, Sequence[str]]:
@@ -116,10 +130,14 @@ def groups() -> dict[str, Sequence[str]]:
 
 
 def differences(ours: pd.DataFrame, other: pd.DataFrame) -> None:
-    """Print the difference in contact lost (negative is better), paired by world and course."""
+    """Print the difference in contact lost (negative is better), paired by world and course.
+
+    The ratio is that of the geometric means over worlds.
+    """
     pairs = ours.merge(other, on=LABELS, suffixes=("", "_other"))
-    table = Table("worlds", "n", "ours minus other [95 % by terrain]", "last four", first=26)
-    for name, kinds in groups().items():
+    columns = "ours minus other [95 % by terrain]", "last four", "ratio", "first missions"
+    table = Table("worlds", "n", *columns, first=26)
+    for group, kinds in groups().items():
         some = pairs[pairs["kind"].isin(kinds)]
         if some.empty:
             continue
@@ -127,14 +145,18 @@ def differences(ours: pd.DataFrame, other: pd.DataFrame) -> None:
         less = pd.DataFrame(
             {name: some[name] - some[f"{name}_other"] for name in ("lost", "lost_last_4")}
         )
+        for name in ("lost", "first"):
+            if f"{name}_other" in some:  # the first mission is not in tables of version 0.5
+                ratio = (some[name] + LEAST) / (some[f"{name}_other"] + LEAST)
+                less[f"ratio {name}"] = np.log(ratio)
         of_worlds = less.groupby(some["world"]).mean()
-        columns = {name: of_worlds[name].to_numpy() for name in of_worlds}
-        found = bootstrap(columns, grounds_of(of_worlds.index), np.mean)
-        ends = (
-            pd.Series({what: found[name, what] for what in ("value", "low", "high")})
-            for name in columns
-        )
-        table.row(name, len(of_worlds), *(interval(one, 3) for one in ends))
+        means = {name: of_worlds[name].to_numpy() for name in of_worlds}
+        found = bootstrap(means, grounds_of(of_worlds.index), np.mean)
+        texts = []
+        for name in means:
+            ends = pd.Series({what: found[name, what] for what in ("value", "low", "high")})
+            texts.append(interval(np.exp(ends) if name.startswith("ratio") else ends, 3))
+        table.row(group, len(of_worlds), *texts)
     print()
 
 

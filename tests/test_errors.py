@@ -70,7 +70,7 @@ MISTAKES = {
     "None for a path to suggest": (lambda w: tb.Campaign(w, *ENDS).suggest(None), "path"),
     "None for a path": (lambda w: w.along(None), "path"),
     "a path without cells": (lambda w: w.along([]), "path"),
-    "numbers for cells": (lambda w: Planner(w, *ENDS).evaluate([1, 2], PARAMS), "cell"),
+    "numbers for cells": (lambda w: Planner(w, *ENDS).evaluate([1, 2], PARAMS), r"path\[0\]"),
     "a share as text": (lambda w: tb.RegretBound(eps="0.05"), "eps"),
     "a correlation of 1": (lambda w: tb.models.RobotEffect(rho=1.0), "rho"),
     "sight as text": (lambda w: tb.workspace.Sight(crown_base="0.3"), "crown_base"),

@@ -1,7 +1,7 @@
 """Best plans without the planner, found by enumerating every admissible walk.
 
 This module shares no code with `trustbo.planning`. A `World` contains a problem as plain arrays
-over the eight moves into each cell. All walks of the same length are extended at once.
+over the ways into each cell: the eight moves with each set of posts, way = move + 8 set. All walks of the same length are extended at once.
 """
 
 from itertools import pairwise
@@ -20,9 +20,9 @@ class World(NamedTuple):
     objective: str
     start: int
     goal: int
-    into: np.ndarray  # (move, cell): the cell that the move leads to from a cell, -1 if it may not
+    into: np.ndarray  # (way, cell): the cell that the way leads to from a cell, -1 if it may not
     bound_cost: np.ndarray  # (move, cell entered), costs apart from trust
-    u: np.ndarray  # (state, move, cell entered)
+    u: np.ndarray  # (state, way, cell entered)
     B0: np.ndarray  # (state, state)
     x0: np.ndarray  # (state,)
     family: str
@@ -60,7 +60,7 @@ class TooManyError(Exception):
 
 
 def to_goal(into, goal):
-    """Fewest bounds from each cell to the goal by moves (move, cell); 10^6 without a way."""
+    """Fewest bounds from each cell to the goal by ways (way, cell); 10^6 if it is unreachable."""
     far = np.full(into.shape[1] + 1, 10**6)
     far[goal] = 0
     for _ in range(into.shape[1]):
@@ -79,16 +79,17 @@ def best_walk(world, most):
     cost, bound_cost, scores, sums, total = np.zeros(1), np.zeros(1), [], [], 0
     begun = np.pad(world.risk, ((0, 0), (0, 1), (0, 0), (0, 0)))  # nothing is at risk before NONE
     for k in range(1, world.longest + 1):
-        m, walk = np.nonzero(world.into[:, cell] >= 0)
-        other = world.into[m, cell[walk]]
+        way, walk = np.nonzero(world.into[:, cell] >= 0)
+        other = world.into[way, cell[walk]]
         fits = far[other] <= world.longest - k
         if not world.turns:
-            fits &= (came[walk] == NONE) | (m != 7 - came[walk])
-        m, walk, other = m[fits], walk[fits], other[fits]
+            fits &= (came[walk] == NONE) | (way % 8 != 7 - came[walk])
+        way, walk, other = way[fits], walk[fits], other[fits]
+        m = way % 8
         total += len(m)
         if total > most:
             raise TooManyError
-        x = world.B0 @ x[:, walk] + world.u[:, m, other]
+        x = world.B0 @ x[:, walk] + world.u[:, way, other]
         last = world.loss(x.mean(0))
         cost, bound_cost = cost[walk] + last, bound_cost[walk] + world.bound_cost[m, other]
         # What is at risk in a bound depends on the next move, which is known only now.
@@ -107,21 +108,22 @@ def best_walk(world, most):
 
 
 def score_along(world, path):
-    """Score of one path; -inf if it is not admissible or beyond the limit."""
+    """Score of one path of (cell, set); -inf if it is not admissible or beyond the limit."""
     x, risk, costs, bound_cost, came = world.x0, np.zeros(len(world.risk)), [], 0.0, NONE
-    if path[0] != world.start or path[-1] != world.goal or world.goal in path[:-1]:
+    cells = [cell for cell, _ in path]
+    if cells[0] != world.start or cells[-1] != world.goal or world.goal in cells[:-1]:
         return -np.inf
-    for a, c in pairwise(path):
-        entering = np.flatnonzero(world.into[:, a] == c)
+    for (a, posts), (c, _) in pairwise(path):
+        entering = np.flatnonzero(world.into[:8, a] == c)
         if not len(entering) or (not world.turns and came != NONE and entering[0] == 7 - came):
             return -np.inf
         if came != NONE:
             risk = risk + world.risk[:, came, a, entering[0]]
         came = entering[0]
-        x = world.B0 @ x + world.u[:, came, c]
+        x = world.B0 @ x + world.u[:, came + 8 * posts, c]
         costs.append(world.loss(x.mean()))
         bound_cost = bound_cost + world.bound_cost[came, c]
-    risk = risk + world.risk[:, came, path[-1], NONE]
+    risk = risk + world.risk[:, came, cells[-1], NONE]
     if len(costs) > world.longest or -world.share @ np.expm1(-risk) > world.limit:
         return -np.inf
     return world.score(sum(costs), costs[-1], bound_cost, risk, len(costs))

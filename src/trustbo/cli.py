@@ -288,6 +288,7 @@ def _finish(result: "Result", folder: Path, quiet: bool) -> None:
     """Write the report and, with a terrain, the maps and the path for GIS; print a summary."""
     import matplotlib as mpl
 
+    from trustbo.data import path_text
     from trustbo.export import export_result
     from trustbo.report import write_report
 
@@ -299,7 +300,7 @@ def _finish(result: "Result", folder: Path, quiet: bool) -> None:
         print(result.table().filter(_COLUMNS).to_string(float_format="%.3f"))
     done = "all missions were run; for more, use trustbo resume with --missions"
     print(f"stopped: {done if result.stop_reason == 'n_iterations' else result.stop_reason}")
-    print(f"recommended path: {' '.join(f'{row},{col}' for row, col in result.path)}")
+    print(f"recommended path: {path_text(result.path)}")
     print(f"results are in {folder}; open {folder / 'report.html'}")
 
 

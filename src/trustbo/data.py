@@ -23,6 +23,13 @@ from trustbo.errors import (
 )
 
 Cell = tuple[int, int]
+Station = tuple[Any, ...]
+"""Cell of a path, (row, col), or (row, col, name) with the set of posts for the move out of it."""
+POST_SETS = ("standard", "far", "route", "wide")
+"""Names of the sets of posts from which T2 can watch the lead's move out of a cell.
+
+A cell of a path without a name means the first set.
+"""
 STATUSES = ("ok", "stuck", "tipped", "timeout", "collision", "lost_contact", "aborted")
 NOWHERE: Cell = (-1, -1)
 """Cell of the bounds in a log without a map."""
@@ -106,7 +113,9 @@ class Mission(Summary):
     driven a bound back to the previous cell.
 
     Attributes:
-        path: Planned cells, start first, each (row, col); empty in a log without a map.
+        path: Planned cells, start first, each (row, col), or (row, col, name) if T2 watched the
+            lead's move out of the cell from another set of posts than the standard one (see
+            `Workspace.from_terrain`); empty in a log without a map.
         awareness: Situational awareness, shape (bound, robot, feature), in [0, 1], or any finite
             values in a log without a map; NaN where not measured.
         contact_rate: Fraction of time in contact, shape (bound, robot); NaN where not measured.
@@ -140,7 +149,7 @@ class Mission(Summary):
         (0, 1)
     """
 
-    path: tuple[Cell, ...]
+    path: tuple[Station, ...]
     awareness: np.ndarray
     contact_rate: np.ndarray
     duration: np.ndarray
@@ -162,7 +171,7 @@ class Mission(Summary):
             levels_of(self.scale)
 
         kept: dict[str, Any] = {
-            "path": require_cells("path", self.path),
+            "path": require_path("path", self.path),
             "bound_status": tuple(self.bound_status),
         }
         kept |= self._measurements() | self._ticks()
@@ -231,7 +240,9 @@ class Mission(Summary):
                 f"run, and the last one has the status {last!r}; give the status of the mission."
             )
 
-        if min(map(min, self.path), default=0) < 0:  # would be read from the other end
+        if (
+            min((min(cell[:2]) for cell in self.path), default=0) < 0
+        ):  # would be read from the other end
             raise TrustboError(
                 f"rows and columns are counted from 0, but the path is {self.path}; give path=None "
                 "for a log without a map."
@@ -240,7 +251,7 @@ class Mission(Summary):
     def _name_of(self, k: int) -> str:
         """Return what messages call bound k, counted from 0."""
         mapped = len(self.path) > k + 1
-        return f"the bound into cell {tuple(self.path[k + 1])}" if mapped else f"bound {k + 1}"
+        return f"the bound into cell {self.path[k + 1][:2]}" if mapped else f"bound {k + 1}"
 
     def _rows(self) -> Rows:
         rates = self.contact_rate
@@ -313,7 +324,7 @@ class Mission(Summary):
         seconds = _per_robot("duration", duration, known, shape)
         ticks = _per_robot("n_ticks", n_ticks, known, shape)
 
-        cells = () if path is None else require_cells("path", path)
+        cells = () if path is None else require_path("path", path)
         if path is not None and not cells:
             raise TrustboError("path must contain cells; give None for a log without a map.")
 
@@ -424,14 +435,14 @@ class Mission(Summary):
         return [*self.bound_status[:-1], self.status]
 
     @property
-    def driven(self) -> tuple[Cell, ...]:
+    def driven(self) -> tuple[Station, ...]:
         """Cells of the path that were entered, start first; empty in a log without a map."""
         return self.path[: len(self.contact_rate) + 1]
 
     @cached_property
     def bounds(self) -> tuple[Bound, ...]:
         """Bounds that were run, whose arrays are views of those of the mission."""
-        cells = self.driven[1:] or (NOWHERE,) * len(self.contact_rate)
+        cells = [cell[:2] for cell in self.driven[1:]] or [NOWHERE] * len(self.contact_rate)
         columns = (getattr(self, name) for name in _COLUMNS)
 
         return tuple(Bound(*values) for values in zip(cells, *columns, strict=True))
@@ -466,9 +477,14 @@ def require_map(what: str, missions: Iterable[Mission]) -> None:
             )
 
 
-def path_text(path: Iterable[Cell]) -> str:
-    """Write cells as on the command line: "9,0 8,1"."""
-    return " ".join(f"{row},{col}" for row, col in path)
+def require_path(what: str, value: object) -> tuple[Station, ...]:
+    """Return the cells of a path; raises TrustboError if a cell or a set of posts is invalid."""
+    return require_cells(what, value, POST_SETS)
+
+
+def path_text(path: Iterable[Station]) -> str:
+    """Write cells as on the command line: "9,0 8,1", or "9,0,far 8,1" with a set of posts."""
+    return " ".join(",".join(map(str, cell)) for cell in path)
 
 
 def is_line_of_sight(feature: str) -> bool:

@@ -5,7 +5,7 @@ import math
 import operator
 import unicodedata
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -203,10 +203,26 @@ def require_tuple(what: str, value: Any, n: int) -> tuple[float, ...]:
     return tuple(require_finite(f"{what}[{k}]", number) for k, number in enumerate(numbers))
 
 
-def require_cells(what: str, value: object) -> tuple[tuple[int, int], ...]:
-    """Return cells (row, col) in order, such as a path; raises TrustboError if any is invalid."""
+def require_cells(
+    what: str, value: object, posts: Sequence[str] = ()
+) -> tuple[tuple[Any, ...], ...]:
+    """Return cells (row, col) in order, such as a path; raises TrustboError if any is invalid.
+
+    With `posts`, the names of sets of posts, a cell may be (row, col, name); the first name is
+    left out of the result.
+    """
     cells = require_list(what, value, remedy="give cells (row, col)")
-    return tuple(require_pair(f"{what}[{k}]", cell) for k, cell in enumerate(cells))
+    return tuple(_require_cell(f"{what}[{k}]", cell, posts) for k, cell in enumerate(cells))
+
+
+def _require_cell(what: str, value: Any, posts: Sequence[str]) -> tuple[Any, ...]:
+    """Return a cell (row, col), or (row, col, name) with the name of a set in `posts`."""
+    is_named = isinstance(value, tuple | list) and len(value) == 3 and isinstance(value[2], str)
+    if not (posts and is_named):
+        return require_pair(what, value)
+    name = require_choice(f"the posts of {what}", value[2], posts)
+    cell = require_pair(what, value[:2])
+    return cell if name == posts[0] else (*cell, name)
 
 
 def require_pair(what: str, value: object) -> tuple[int, int]:

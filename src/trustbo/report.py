@@ -144,9 +144,9 @@ def bounds_of(result: Result) -> pd.DataFrame:
     earlier = [mission for mission in result.state.earlier.missions if not mission.map]
     rates = defaultdict(list)  # by the cells left and entered
     for mission in [*earlier, *result.missions]:
-        for ends, rate in zip(pairwise(mission.path), mission.contact_rate, strict=False):
-            rates[ends].append(pd.Series(rate).mean())  # of the measured robots
-    of_path = [pd.Series(rates[ends], dtype=float) for ends in pairwise(plan.path)]
+        for (a, c), rate in zip(pairwise(mission.path), mission.contact_rate, strict=False):
+            rates[a, c[:2]].append(pd.Series(rate).mean())  # of the measured robots
+    of_path = [pd.Series(rates[a, c[:2]], dtype=float) for a, c in pairwise(plan.path)]
 
     table = plan.to_frame()
     table["contact"] = [np.nan, *contact.mean(1)]

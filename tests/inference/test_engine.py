@@ -100,6 +100,31 @@ def test_effects_of_cells_given_missions_on_other_maps_are_those_of_the_joint_no
     np.testing.assert_allclose(drawn.std(0)[some], sd[some], rtol=5.0 / np.sqrt(8000))
 
 
+def posterior_with_posts(name):
+    """As `posterior_of`, where some bounds are watched from the second or third set of posts."""
+    model = GAUSSIAN[name].for_features(FEATURES)
+    observations, bounds = observed(gaps=True)
+    posts = np.random.default_rng(2).integers(0, 3, bounds.shape[:2])
+    bounds = bounds + 8 * np.where(bounds[..., :1] >= 0, posts[..., None], 0) * (1, 0, 0)
+
+    posterior = Density(model, observations._replace(visited=visited(bounds, GRID)))
+    z = 0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores))
+    return posterior, posterior.theta(z), lambda at: DenseRates(model, observations, at, bounds)
+
+
+@pytest.mark.parametrize("name", [name for name in GAUSSIAN if "places" in name])
+def test_effects_of_a_bound_are_correlated_between_sets_of_posts(name):
+    posterior, theta, dense = posterior_with_posts(name)
+    ways = posterior.observations.visited.bounds
+    assert len(np.unique(ways % (8, 100, 100), axis=0)) < len(ways)
+    np.testing.assert_allclose(posterior.log_evidence(theta), dense(theta).log_density(), rtol=1e-9)
+
+
+def test_slopes_with_sets_of_posts_are_those_of_the_density():
+    posterior, *_ = posterior_with_posts(f"pooled, {EVERYTHING}")
+    require_equal_slopes(posterior)
+
+
 def require_equal_slopes(posterior):
     """Compare slopes at random scores with differences of the density."""
     z = 0.5 * np.random.default_rng(3).standard_normal((2, posterior.n_scores))

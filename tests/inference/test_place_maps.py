@@ -38,6 +38,39 @@ def drawn(workspace, **parameters):
     return place_maps_of(group, values, workspace)["place_bound"][:, 0]
 
 
+def test_a_driven_bound_teaches_the_other_sets_of_posts_of_the_same_bound():
+    """Two of three sets were driven; the third has the conditional normal of all three."""
+    z = np.full((2, 24, *SHAPE, 1), 0.7)
+    z[:, 21, 1, 1] = 0.9
+    space = tb.Workspace.from_awareness(z, features=("line_of_sight",))
+    places = visited(np.array([[VISITED, (13, 1, 1)]]), SHAPE)
+    known = np.random.default_rng(0).normal(0.05, 0.1, (1, N_DRAWS, 2))
+    draws = {
+        "place": np.zeros((1, N_DRAWS, 1)),
+        "place_bound": known,
+        "place_robot": np.zeros((1, N_DRAWS, 2, 2)),
+    }
+    values = {"tau_s": 0.0, "length_scale": 2.0, "tau_e": TAU, "f_e": FLOOR}
+    values = {name: np.full(N_DRAWS, value) for name, value in values.items()}
+    group = place_group(draws, places, ["r1", "r2"], seed=5)
+    e = place_maps_of(group, values, space)["place_bound"][:, 0]
+    np.testing.assert_array_equal(e[:, [5, 13], 1, 1], known[0])
+
+    m = np.array([0.7, 0.7, 0.9])
+    sd = TAU * np.sqrt(FLOOR**2 + (1.0 - FLOOR**2) * 4.0 * m * (1.0 - m))
+    cov = np.outer(sd, sd) * (0.5 + 0.5 * np.eye(3))
+    gain = np.linalg.solve(cov[:2, :2], cov[:2, 2])
+    rest = e[:, 21, 1, 1] - known[0] @ gain
+    assert distance(rest, norm(scale=np.sqrt(cov[2, 2] - cov[2, :2] @ gain)).cdf) < 0.02
+
+    # Without a driven set, those of a bound are alike, and those of other bounds are not.
+    free = e[:, [0, 8, 16, 1], 2, 2]
+    expected = 0.5 + 0.5 * np.eye(4)
+    expected[3, :3] = expected[:3, 3] = 0.0
+    ordinary = (np.abs(free) < 0.2).all(1)  # the map is wrong in a few draws, independently
+    assert np.abs(np.corrcoef(free[ordinary].T) - expected).max() < 0.15
+
+
 def distance(draws, cdf):
     """Return the largest distance of the empirical distribution from a continuous one."""
     x = np.sort(draws)

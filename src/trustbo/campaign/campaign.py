@@ -399,9 +399,10 @@ class Campaign(Recorder):
             self.storage.require_open()
             path = self.ask().path if reason in CAUSES or where is not None else ()
             where = None if where is None else require_pair("where", where)
-            if where is not None and (reason not in CAUSES or where not in path[1:]):
+            entered = tuple(station[:2] for station in path[1:])
+            if where is not None and (reason not in CAUSES or where not in entered):
                 raise TrustboError(
-                    f"where = {where} must be a cell that the plan enters, {path[1:]}, with one of "
+                    f"where = {where} must be a cell that the plan enters, {entered}, with one of "
                     f"the reasons {', '.join(CAUSES)}; got reason {reason!r}."
                 )
 

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.replan import trust_filter
-from trustbo.data import MEASURED, STATUSES, Bound, Cell, Mission, path_text
+from trustbo.data import MEASURED, STATUSES, Bound, Cell, Mission, Station, path_text
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
     TrustboError,
@@ -54,7 +54,7 @@ class Follower(Summary):
             TrustboError: `campaign` is not a campaign, or cannot plan a path (see `Campaign.ask`).
         """
         require_kind("campaign", campaign, Campaign, "give a trustbo.Campaign")
-        self.path: tuple[Cell, ...] = tuple(campaign.ask().path)
+        self.path: tuple[Station, ...] = tuple(campaign.ask().path)
         self._campaign = campaign
         self._workspace = campaign.workspace
         self._goal = self.path[-1]
@@ -85,7 +85,7 @@ class Follower(Summary):
         ]
 
     @property
-    def rest(self) -> tuple[Cell, ...]:
+    def rest(self) -> tuple[Station, ...]:
         """Cell that the lead is in or is entering, followed by the planned cells."""
         n_entered = len(self.bounds) + 1 if self.running else len(self.bounds)
         return self.path[n_entered:]
@@ -109,7 +109,11 @@ class Follower(Summary):
         here, *planned = self.rest
         if cell is None and not planned:
             raise TrustboError(f"no cell is planned after {here}; pass the next cell to begin.")
-        cell = planned[0] if cell is None else require_pair("cell", cell)
+        if cell is None:
+            cell = planned[0]
+        else:  # the planned cell has the planned posts
+            cell = require_pair("cell", cell)
+            cell = next((station for station in planned[:1] if station[:2] == cell), cell)
 
         self._count(t, np.zeros_like(self._counts), (here, cell))
         if planned[:1] != [cell]:
@@ -158,7 +162,7 @@ class Follower(Summary):
         since = self._begun - self._started
 
         rates, n_ticks = self._measured
-        bound = Bound(self.rest[0], unknown, rates, seconds, n_ticks, status, since)
+        bound = Bound(self.rest[0][:2], unknown, rates, seconds, n_ticks, status, since)
         self.bounds = (*self.bounds, bound)
         self.running = False
         self._is_over = status != "ok"
@@ -189,7 +193,7 @@ class Follower(Summary):
         self._require(running=False)
         n = len(self.bounds)
         if cell is None:
-            cell = self.path[n - 1] if self._is_over else self.path[n]
+            cell = self.path[n - 1 if self._is_over else n][:2]
 
         so_far = self.to_mission() if n else None
         plan = self._campaign.replan(cell, so_far, blocked=blocked)
@@ -237,7 +241,7 @@ class Follower(Summary):
             robots=workspace.team.names,
         )
 
-    def _count(self, t: float, counts: np.ndarray, bound: tuple[Cell, Cell]) -> None:
+    def _count(self, t: float, counts: np.ndarray, bound: tuple[Station, Station]) -> None:
         """Store tick counts (2, robot) of a bound, and the trust as if the bound ended now."""
         now = copy(self._before)  # shallow, since `update` replaces arrays
 

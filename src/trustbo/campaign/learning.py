@@ -66,16 +66,14 @@ def require_new(state: State, mission: Mission) -> None:
 
 def require_ends(plan: Plan, mission: Mission) -> None:
     """Raise TrustboError unless a mission has the plan's start and, if it is "ok", its goal."""
-    start = plan.path[0]
-    goal = plan.path[-1]
-    if mission.path[0] != start:
-        raise TrustboError(
-            f"the mission starts in cell {mission.path[0]}; it must start in {start}."
-        )
-    if mission.status == "ok" and mission.path[-1] != goal:
+    start, goal = (plan.path[k][:2] for k in (0, -1))
+    first, last = (mission.path[k][:2] for k in (0, -1))
+    if first != start:
+        raise TrustboError(f"the mission starts in cell {first}; it must start in {start}.")
+    if mission.status == "ok" and last != goal:
         raise TrustboError(
             f'the status "ok" means that the goal {goal} was reached, but the mission ends in cell '
-            f"{mission.path[-1]}; give the planned cells up to the goal, and a status such as "
+            f"{last}; give the planned cells up to the goal, and a status such as "
             '"aborted".'
         )
 
@@ -217,6 +215,7 @@ def _with_planned_path(mission: Mission, plan: Plan) -> Mission:
     The failure probability of a bound depends on the next move, which is then known.
     """
     n = len(mission.path)
-    if mission.status == "ok" or len(plan.path) <= n or plan.path[:n] != mission.path:
+    is_begun = all(a[:2] == b[:2] for a, b in zip(plan.path, mission.path, strict=False))
+    if mission.status == "ok" or len(plan.path) <= n or not is_begun:
         return mission
-    return replace(mission, path=plan.path)
+    return replace(mission, path=(*mission.path, *plan.path[n:]))

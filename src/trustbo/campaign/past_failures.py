@@ -36,7 +36,8 @@ def with_past_failures(
     risk = planner.problem.risk
     if risk is None:
         return plan
-    ends = zip(plan.path[1:], [*plan.path[2:], None], strict=True)
+    cells = [station[:2] for station in plan.path]
+    ends = zip(cells[1:], [*cells[2:], None], strict=True)
     ahead = [(k, *end) for k, end in enumerate(ends, start=1) if k > plan.n_driven]
 
     found = []
@@ -65,7 +66,8 @@ def _failures(
     """
     goal = tuple(state.settings["goal"])
     for number, mission in missions_of_hazard(state, so_far):
-        bounds = zip(pairwise(mission.path), mission.statuses, strict=False)
+        cells = [station[:2] for station in mission.path]
+        bounds = zip(pairwise(cells), mission.statuses, strict=False)
         failed = {ends: status for ends, status in bounds if status in CAUSES}
         if failed:
             for bound in _failed(Trials.from_missions([mission], goal=goal)):

@@ -131,7 +131,7 @@ def state_from_record(
 
     failures = []
     for after, reason, path, where in record["failures"]:
-        cells = tuple((row, col) for row, col in path)
+        cells = tuple(map(tuple, path))
         failures.append(Failure(after, reason, cells, None if where is None else tuple(where)))
 
     asked = record["asked"]

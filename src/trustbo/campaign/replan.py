@@ -12,7 +12,7 @@ from trustbo.campaign.choose import choose, informed_planner
 from trustbo.campaign.learning import as_learned, learn_hazard
 from trustbo.campaign.past_failures import with_past_failures
 from trustbo.campaign.result import Result
-from trustbo.data import Cell, Mission, path_text
+from trustbo.data import Cell, Mission, Station, path_text
 from trustbo.errors import TrustboError
 from trustbo.hazard.path_risk import PathRisk
 from trustbo.hazard.risk import BoundRisk
@@ -71,9 +71,9 @@ def follow(
         z = workspace.along(path, anywhere=True)
     else:
         path = so_far.path[: len(so_far.bounds) + 1]
-        if path[0] != plan.path[0]:
+        if path[0][:2] != plan.path[0][:2]:
             raise TrustboError(
-                f"the mission starts in cell {path[0]}; it must start in {plan.path[0]}."
+                f"the mission starts in cell {path[0][:2]}; it must start in {plan.path[0][:2]}."
             )
 
         rates = so_far.contact_rate
@@ -81,7 +81,7 @@ def follow(
         z = as_learned(so_far, workspace, result.state.settings["awareness"]).awareness
         closed += failed_bounds(so_far)
 
-        if cell != path[-1]:
+        if cell != path[-1][:2]:
             path = _returned(path, cell, so_far)
             z = np.concatenate([z, workspace.along(path[-2:], anywhere=True)])
             rates = np.pad(rates, ((0, 1), (0, 0)), constant_values=np.nan)
@@ -101,22 +101,23 @@ def follow(
     return Driven(path, rates, mean, bands, tuple(dict.fromkeys(closed)), trust)
 
 
-def _planned(path: tuple[Cell, ...], cell: Cell) -> tuple[Cell, ...]:
+def _planned(path: tuple[Station, ...], cell: Cell) -> tuple[Station, ...]:
     """Return the planned path up to a cell."""
-    if path.count(cell) != 1:
-        often = "does not enter" if cell not in path else "enters more than once"
+    cells = [station[:2] for station in path]
+    if cells.count(cell) != 1:
+        often = "does not enter" if cell not in cells else "enters more than once"
         raise TrustboError(
             f"the plan {path_text(path)} {often} the cell {cell}; pass the bounds so far as a "
             "mission."
         )
-    return path[: path.index(cell) + 1]
+    return path[: cells.index(cell) + 1]
 
 
-def _returned(path: tuple[Cell, ...], cell: Cell, so_far: Mission) -> tuple[Cell, ...]:
+def _returned(path: tuple[Station, ...], cell: Cell, so_far: Mission) -> tuple[Station, ...]:
     """Return the path so far, followed by a bound back from the cell that was not reached."""
     # If a mission stops after a bound that was completed, only the mission has another status.
     is_completed = so_far.bounds[-1].status == "ok" and so_far.status not in CAUSES
-    possible = path[-1:] if is_completed else path[-2:]
+    possible = [station[:2] for station in (path[-1:] if is_completed else path[-2:])]
     if cell not in possible:
         places = " or ".join(map(str, possible))
         raise TrustboError(f"after the bounds so far, the team is in {places}, not in {cell}.")
@@ -125,7 +126,8 @@ def _returned(path: tuple[Cell, ...], cell: Cell, so_far: Mission) -> tuple[Cell
 
 def failed_bounds(mission: Mission) -> list[Pair]:
     """Return the cells left and entered of each bound that failed."""
-    bounds = zip(pairwise(mission.path), mission.statuses, strict=False)
+    cells = [station[:2] for station in mission.path]
+    bounds = zip(pairwise(cells), mission.statuses, strict=False)
     return [bound for bound, status in bounds if status in CAUSES]
 
 
@@ -184,7 +186,7 @@ def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:
         driven: Bounds so far.
         rest: Plan from the last cell of `driven` to the goal.
     """
-    path = (*driven.path, *rest.path[1:])
+    path = (*driven.path[:-1], *rest.path)  # with the posts that the rest begins with
     n_driven = len(driven.path) - 1
 
     risk = rest.risk

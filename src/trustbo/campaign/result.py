@@ -15,7 +15,7 @@ from trustbo.campaign.folder import FolderStorage, without_lost_posteriors
 from trustbo.campaign.learning import fitted_missions, learn_hazard
 from trustbo.campaign.past_failures import with_past_failures
 from trustbo.campaign.state import State
-from trustbo.data import NOWHERE, Cell, Mission
+from trustbo.data import NOWHERE, POST_SETS, Cell, Mission
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_kind
 from trustbo.files import FilePath
@@ -28,8 +28,10 @@ from trustbo.parallel import computing
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.maps import maps_of
 from trustbo.simulation import Truth
+from trustbo.stacking import padded
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
+from trustbo.workspace.moves import cells_along, posts_along
 
 if TYPE_CHECKING:
     from trustbo.plots.explorer import Explorer
@@ -254,6 +256,7 @@ class Result(Summary):
         cell: Location | None = None,
         *,
         move: str | None = None,
+        posts: str = POST_SETS[0],
         as_rate: bool = False,
         expected: bool = False,
     ) -> xr.DataArray:
@@ -268,6 +271,7 @@ class Result(Summary):
                 `Workspace.locate`); by default all cells.
             move: Direction of the bound that enters the cell, such as `"ne"`; by default the mean
                 over all directions.
+            posts: Set of posts from which T2 watches; see `Workspace.post_sets`.
             as_rate: Whether to return the expected contact rate instead of trust.
             expected: Whether to use the expected effects of robots in the next mission, instead of
                 drawing them.
@@ -277,15 +281,15 @@ class Result(Summary):
             col). If a robot or cell is given, its dims are left out. See `planning.Planner.trust`.
 
         Raises:
-            TrustboError: The robot or move is unknown, the cell is off the grid or impassable, or
-                no such bound enters the cell.
+            TrustboError: The robot, move or set of posts is unknown, the cell is off the grid or
+                impassable, or no such bound enters the cell.
 
         Example:
             >>> trust = result.trust("r2", (3, 4))
             >>> float(trust.mean()), float(trust.std())
         """
         draws = self._ahead.of_robots(expected=expected)
-        return self._base.trust(draws, robot, cell, move=move, as_rate=as_rate)
+        return self._base.trust(draws, robot, cell, move=move, posts=posts, as_rate=as_rate)
 
     def robot_maps(self, *, expected: bool = False) -> xr.Dataset:
         """Compute maps of the trust in each robot in the next mission.
@@ -310,20 +314,25 @@ class Result(Summary):
         """Dataset of the quantities of each mission, with dim `iteration` (1, 2, ...).
 
         It contains the planned `path` (row and col of each step, -1 after the goal), the
-        `trust_map` used for planning, and the numbers and texts of `table`. The attribute
-        `objective` is the name of the objective. Raises TrustboError if there is no mission yet.
+        `trust_map` used for planning, and the numbers and texts of `table`. With several sets of
+        posts, it contains the number of the set, `posts`, of each bound (-1 after the last). The
+        attribute `objective` is the name of the objective. Raises TrustboError if there is no
+        mission yet.
         """
         entries = self.state.entries
         if not entries:
             raise TrustboError("the campaign has no mission yet; call tell or run first.")
 
-        paths = [entry.plan.path for entry in entries]
+        paths = [cells_along(entry.plan.path).tolist() for entry in entries]
         steps = np.stack([*zip_longest(*paths, fillvalue=NOWHERE)], axis=1)
         numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
         table = pd.DataFrame([self.state.row(j) for j in range(len(entries))], numbers)
 
         history = table.drop(columns=["where", "failed_bounds", "n_bounds", "path"]).to_xarray()
         history["path"] = ("iteration", "step", "axis"), steps
+        if self.workspace.n_posts > 1:
+            sets = [posts_along(entry.plan.path) for entry in entries]
+            history["posts"] = ("iteration", "bound"), padded(sets, -1)
         history["trust_map"] = xr.concat([entry.trust_map for entry in entries], numbers)
         history.attrs["objective"] = self.settings["objective"]
         return history.assign_coords(axis=["row", "col"])

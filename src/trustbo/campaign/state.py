@@ -56,7 +56,9 @@ class Failure(NamedTuple):
             "reason": self.reason,
             "where": where,
             "failed_bounds": where and f"into {where} ({self.reason})",
-            "n_bounds": np.nan if self.where is None else self.path.index(self.where, 1),
+            "n_bounds": np.nan
+            if self.where is None
+            else [station[:2] for station in self.path].index(self.where, 1),
             "path_changed": False,
             "replanned": False,
             "path": path_text(self.path),
@@ -171,7 +173,7 @@ class Entry:
         mission = self.mission
 
         n_planned = len(mission.path) - 1
-        if mission.path[-1] != plan.path[-1]:  # the path no longer contained the goal
+        if mission.path[-1][:2] != plan.path[-1][:2]:  # the path no longer contained the goal
             n_planned = max(n_planned, len(plan.path) - 1)
         rates = mission.contact_rate
         failed = [cell for _, cell, _ in incomplete_bounds(mission)]

@@ -12,11 +12,13 @@ from rasterio.io import MemoryFile
 from shapely import affinity
 
 from trustbo.campaign.result import Result
+from trustbo.data import POST_SETS
 from trustbo.errors import TrustboError, require_kind
 from trustbo.files import FilePath, to_path, write_file, write_text
 from trustbo.logs.table import to_frame
 from trustbo.planning import Plan
 from trustbo.terrain.place import converted, quiet_affine
+from trustbo.workspace.moves import cells_along, posts_along
 
 _NO_CRS = "this export needs a CRS; make the workspace with Workspace.from_terrain."
 _TIFF = (".tif", ".tiff")
@@ -104,14 +106,18 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     features = [_feature(plan, "path", plan.positions, facts | {"length_m": float(plan.length)})]
 
     rows = plan.to_frame().loc[:, "driven":].to_dict("records")
-    for k, (cell, place, row) in enumerate(zip(plan.path, plan.positions, rows, strict=True)):
+    cells = cells_along(plan.path).tolist()
+    for k, (cell, place, row) in enumerate(zip(cells, plan.positions, rows, strict=True)):
         known = {name: value for name, value in row.items() if pd.notna(value)}
-        features.append(_feature(plan, "bounds", place, {"bound": k, **known, "cell": [*cell]}))
+        features.append(_feature(plan, "bounds", place, {"bound": k, **known, "cell": cell}))
 
     team = plan.workspace.team
-    for k, (cell, places) in enumerate(zip(plan.path, _of(plan.posts), strict=False), start=1):
+    sets = posts_along(plan.path)
+    for k, (cell, places) in enumerate(zip(cells, _of(plan.posts), strict=False), start=1):
         for robot, place in zip(team.names, places, strict=True):
-            about = {"bound": k, "robot": robot, "driven": k <= plan.n_driven, "cell": [*cell]}
+            about = {"bound": k, "robot": robot, "driven": k <= plan.n_driven, "cell": cell}
+            if plan.workspace.n_posts > 1:
+                about["posts"] = POST_SETS[sets[k - 1]]
             features.append(_feature(plan, "posts", place, about))
 
     for k, routes in enumerate(_of(plan.routes), start=1):

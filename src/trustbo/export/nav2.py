@@ -167,7 +167,7 @@ def write_nav2(
     folder = to_path(folder)
     plan = result.plan if isinstance(result, Result) else result
     workspace = result.workspace
-    place = Frame(workspace.grid.center(plan.path[0])) if frame is None else frame
+    place = Frame(workspace.grid.center(plan.path[0][:2])) if frame is None else frame
 
     # All contents are made before the first file is written, so that an error leaves no incomplete
     # set of files.
@@ -390,7 +390,12 @@ def _graph(result: Result, frame: Frame) -> str:
         features.append(_feature("Point", xy, about))
 
     failure_cost = result.planner.problem.cost_of_failure
-    for a, c, edge in graph.edges(data=True):
+    edges: dict[Any, dict[str, float]] = {}
+    for a, c, edge in graph.edges(data=True):  # of parallel edges, the one with the best posts
+        if (a, c) not in edges or edge["lost"] < edges[a, c]["lost"]:
+            edges[a, c] = edge
+
+    for (a, c), edge in edges.items():
         move = MOVES.index((c[0] - a[0], c[1] - a[1]))
         p_fail = -math.expm1(-edge.get("risk", 0.0))
         cost = max(edge["lost"] + failure_cost * p_fail, _MIN_COST)

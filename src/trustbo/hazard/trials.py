@@ -143,7 +143,7 @@ class Trials(NamedTuple):
 
 def _reported(mission: Mission, goal: Cell | None) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds that were completed or failed, (bound, 4), and whether each one failed."""
-    path = mission.path
+    path = [station[:2] for station in mission.path]
     statuses = mission.statuses
 
     fails = np.array([status in CAUSES for status in statuses])
@@ -167,8 +167,9 @@ def _reported(mission: Mission, goal: Cell | None) -> tuple[np.ndarray, np.ndarr
 
 def _located(mission: LostMission) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds of a lost mission up to `where`, and whether each one failed."""
-    if mission.where not in mission.path[1:]:
+    cells = [station[:2] for station in mission.path]
+    if mission.where not in cells[1:]:
         raise TrustboError(f"where must be a cell that the path enters; got {mission}.")
 
-    n = mission.path.index(mission.where, 1)
+    n = cells.index(mission.where, 1)
     return bounds_and_next(mission.path[: n + 2])[:n], np.arange(1, n + 1) == n

@@ -8,8 +8,8 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import Names, evenly_spaced, read_labelled
-from trustbo.data import Cell, require_shares, require_unit_interval
-from trustbo.errors import TrustboError, one_line, require_pair, require_whole
+from trustbo.data import Station, require_path, require_shares, require_unit_interval
+from trustbo.errors import TrustboError, one_line, require_whole
 from trustbo.inference.draws import as_fitted
 from trustbo.inference.importance import systematic
 from trustbo.inference.learner import params_of
@@ -173,7 +173,7 @@ class TrustFilter:
         self,
         awareness: ArrayLike,
         contact_rate: ArrayLike,
-        bound: tuple[Cell, Cell] | None = None,
+        bound: tuple[Station, Station] | None = None,
         *,
         n_ticks: ArrayLike | None = None,
     ) -> TrustState:
@@ -231,7 +231,7 @@ class TrustFilter:
         return self.params.draw(systematic(self.weights, len(self.weights), rng))
 
     @computing()
-    def predict(self, awareness: ArrayLike, path: Sequence[Cell] | None = None) -> TrustForecast:
+    def predict(self, awareness: ArrayLike, path: Sequence[Station] | None = None) -> TrustForecast:
         """Predict trust and contact rates along future bounds.
 
         One rate per bound and robot is drawn for each parameter draw. Future bounds are assumed to
@@ -270,7 +270,7 @@ class TrustFilter:
         """
         return kalman.forecast(self.space, self._belief, inputs, n_ticks, self.likelihood, rng)
 
-    def inputs(self, awareness: np.ndarray, path: Sequence[Cell] | None) -> list[Inputs]:
+    def inputs(self, awareness: np.ndarray, path: Sequence[Station] | None) -> list[Inputs]:
         """Return the inputs (draw, group, member) of each bound of a path.
 
         `awareness` has shape (bound, robot, feature).
@@ -278,8 +278,8 @@ class TrustFilter:
         bounds = self._bounds(path, len(awareness))
         return self.params.along(np.swapaxes(awareness, 0, 1), bounds, self.space)
 
-    def _bounds(self, path: Sequence[Cell] | None, n_bounds: int) -> np.ndarray:
-        """Return the moves, rows and columns (bound, 3) of a path; moves are -1 if not needed.
+    def _bounds(self, path: Sequence[Station] | None, n_bounds: int) -> np.ndarray:
+        """Return the ways, rows and columns (bound, 3) of a path; ways are -1 if not needed.
 
         Raises:
             TrustboError: If the path is missing, has the wrong length, jumps or leaves the grid.
@@ -288,8 +288,7 @@ class TrustFilter:
         if path is None and grid is None:
             return np.full((n_bounds, 3), -1)
 
-        given = path if isinstance(path, Iterable) else []
-        cells = [require_pair("a cell", cell) for cell in given]
+        cells = require_path("path", path if isinstance(path, Iterable) else [])
         if len(cells) != n_bounds + 1:
             raise TrustboError(
                 f"bound or path must have {n_bounds + 1} cells, beginning with the current cell of "

@@ -23,7 +23,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from trustbo.arrays import joined_draws
 from trustbo.data import is_line_of_sight
-from trustbo.models.effects.place import matern
+from trustbo.models.effects.effect import LEAST
+from trustbo.models.effects.place import BETWEEN_POSTS, matern
 from trustbo.models.robots_in_bounds import RobotsInBounds
 from trustbo.models.sight_scale import scale_at, variation
 from trustbo.models.visited import Visited
@@ -107,10 +108,16 @@ def place_maps_of(
     cells = np.column_stack([group[f"cell_{name}"].values for name in _CELL])
     place = _cells(s, cells, (rows, cols), parameters, [seed, 0])
 
-    # Effects of bounds are independent, so only those of visited bounds are replaced.
-    place_bound = _of_bounds(parameters, _sight(group, workspace), np.random.default_rng([seed, 1]))
+    # Effects of different bounds are independent, so only those of visited bounds change.
+    sight = _sight(group, workspace)
+    visited = _bounds(group)
+    place_bound = _of_bounds(parameters, sight, visited, np.random.default_rng([seed, 1]))
     _centre(place_bound)
-    place_bound[:, *_bounds(group)] = joined_draws(group["place_bound"], ["bound"])
+
+    e = joined_draws(group["place_bound"], ["bound"])
+    if len(sight) > len(MOVE_NAMES):
+        _learn_from_other_posts(place_bound, visited, e, parameters, sight)
+    place_bound[:, *visited] = e
     return {"place": place[:, None], "place_bound": place_bound[:, None]}
 
 
@@ -132,8 +139,9 @@ def robots_in_bounds_of(
     group = of_workspace(group)
     rows, cols = (int(n) for n in group.attrs["shape"])
     tau_r = parameters["tau_r"]
+    sight = _sight(group, workspace)
 
-    column = np.full((len(MOVE_NAMES), rows, cols), -1)
+    column = np.full((len(sight), rows, cols), -1)
     known = np.zeros((len(tau_r), len(robots), 0))
     if set(robots) <= set(group["robot"].values.tolist()):
         column[*_bounds(group)] = np.arange(group.sizes["bound"])
@@ -145,7 +153,7 @@ def robots_in_bounds_of(
         column=column,
         tau_r=tau_r,
         floor=_floor(parameters),
-        variation=variation(_sight(group, workspace)),
+        variation=variation(sight),
         number=np.arange(len(tau_r)),
         seed=seed,
     )
@@ -157,35 +165,54 @@ def _floor(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _sight(group: xr.Dataset, workspace: Workspace | None) -> np.ndarray:
-    """Return the mean line of sight of the robots, shape (move, row, col).
+    """Return the mean line of sight of the robots, shape (way, row, col).
 
     It is 0.5, where the scale is 1, if line of sight is not predicted.
     """
     rows, cols = (int(n) for n in group.attrs["shape"])
+    if workspace is None:
+        most = int(group["bound_move"].max()) if group.sizes["bound"] else 0
+        n_ways = len(MOVE_NAMES) * (1 + most // len(MOVE_NAMES))
+    else:
+        n_ways = workspace.awareness.sizes["move"]
+
     sight = [] if workspace is None else [*filter(is_line_of_sight, workspace.features)]
     if workspace is None or not sight:
-        return np.full((len(MOVE_NAMES), rows, cols), 0.5)
+        return np.full((n_ways, rows, cols), 0.5)
 
     mean = workspace.awareness.sel(feature=sight).mean(("robot", "feature"), skipna=False)
     return np.nan_to_num(mean.values, nan=0.5)
 
 
 def _of_bounds(
-    parameters: Mapping[str, np.ndarray], sight: np.ndarray, rng: np.random.Generator
+    parameters: Mapping[str, np.ndarray],
+    sight: np.ndarray,
+    visited: tuple[np.ndarray, ...],
+    rng: np.random.Generator,
 ) -> np.ndarray:
-    """Draw effects e (draw, move, row, col) of unvisited bounds, given the mean line of sight.
+    """Draw effects e (draw, way, row, col) of unvisited bounds, given the mean line of sight.
 
     They are normal with standard deviation g tau_e for the scale g. A small share of them, for
     which the map is wrong, are half-normal with scale 3 tau_e, and positive if the line of sight is
-    below 0.5, otherwise negative. In models without the scale, all are normal.
+    below 0.5, otherwise negative. In models without the scale, all are normal, and so are all in
+    bounds that were `visited` with any set of posts.
     """
     tau_e, floor = (x[:, None, None, None] for x in (parameters["tau_e"], _floor(parameters)))
     e = rng.standard_normal((len(tau_e), *sight.shape))
+    n_posts = len(sight) // len(MOVE_NAMES)
+    if n_posts > 1:
+        of_all = rng.standard_normal((len(tau_e), len(MOVE_NAMES), *sight.shape[1:]))
+        e *= np.sqrt(1.0 - BETWEEN_POSTS)
+        e += np.sqrt(BETWEEN_POSTS) * np.tile(of_all, (1, n_posts, 1, 1))
     scale = scale_at(variation(sight), floor)
 
     if "f_e" in parameters:
         to_middle = 0.5 - sight  # 0 where line of sight is not predicted
+        ways, rows, cols = visited
+        is_known = np.zeros((len(MOVE_NAMES), *sight.shape[1:]), bool)
+        is_known[ways % len(MOVE_NAMES), rows, cols] = True
         share = np.where(to_middle == 0.0, 0.0, _SHARE_WRONG)
+        share[np.tile(is_known, (n_posts, 1, 1))] = 0.0
         is_wrong = rng.random(e.shape, dtype=np.float32) < share
         scale[is_wrong] = _SD_WRONG
         np.copysign(e, to_middle, out=e, where=is_wrong)
@@ -193,6 +220,33 @@ def _of_bounds(
     e *= scale
     e *= tau_e
     return e
+
+
+def _learn_from_other_posts(
+    free: np.ndarray,
+    visited: tuple[np.ndarray, ...],
+    e: np.ndarray,
+    parameters: Mapping[str, np.ndarray],
+    sight: np.ndarray,
+) -> None:
+    """Add, in place, what visited sets of posts teach about the other sets of their bounds.
+
+    By Matheron's rule, the draws `free` (draw, way, row, col) of unvisited ways get the kriged
+    difference of the posterior draws `e` (draw, visited) from the free draws of visited ways.
+    """
+    sd = scale_at(variation(sight), _floor(parameters)[:, None, None, None])
+    sd = np.maximum(sd * parameters["tau_e"][:, None, None, None], LEAST)
+
+    shape = len(MOVE_NAMES), *sight.shape[1:]
+    more = np.zeros((len(e), *shape))
+    n_visited = np.zeros(shape)
+    for k, (way, row, col) in enumerate(zip(*visited, strict=True)):
+        bound = way % len(MOVE_NAMES), row, col
+        more[:, *bound] += (e[:, k] - free[:, way, row, col]) / sd[:, way, row, col]
+        n_visited[bound] += 1.0
+
+    more *= BETWEEN_POSTS / (1.0 + (n_visited - 1.0) * BETWEEN_POSTS)
+    free += sd * np.tile(more, (1, len(sight) // len(MOVE_NAMES), 1, 1))
 
 
 def in_order_of_places(group: xr.Dataset) -> xr.Dataset:

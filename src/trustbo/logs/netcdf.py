@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Mission
+from trustbo.data import POST_SETS, Mission
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, interpreting, read_file, to_path, write_file
 from trustbo.stacking import require_same_team
@@ -112,7 +112,8 @@ def missions_to_tree(missions: Iterable[Mission]) -> xr.DataTree:
     ]
     poses, contacts = zip(*ticks, strict=True)
 
-    cells = [cell for mission in missions for cell in mission.path]
+    steps = [station for mission in missions for station in mission.path]
+    cells = [station[:2] for station in steps]
     variables: dict[str, Any] = {
         "path": (("step", "axis"), np.reshape(cells, (-1, 2)).astype(int)),
         "start": ("bound", [bound.t0 for bound in bounds], {"units": "s"}),
@@ -128,6 +129,8 @@ def missions_to_tree(missions: Iterable[Mission]) -> xr.DataTree:
         values = np.concatenate([getattr(mission, name) for mission in missions])
         dims = ("bound", "robot", "feature")[: values.ndim]
         variables[name] = (dims, values, {"units": units})
+    if cells != steps:
+        variables["posts"] = "step", [(*station, POST_SETS[0])[2] for station in steps]
     for name in _TEXTS:
         variables[name] = ("mission", [getattr(mission, name) for mission in missions])
 
@@ -147,9 +150,13 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
         of_bounds = [values if len(values) else None for values in parts(table[name], "recorded")]
         return [tuple(of_mission) for of_mission in parts(of_bounds, "n_bounds")]
 
+    steps = table["path"].tolist()
+    if "posts" in table:
+        steps = [(*cell, name) for cell, name in zip(steps, table["posts"].tolist(), strict=True)]
+
     columns = {name: parts(table[name], "n_bounds") for name in _ARRAYS}
     columns |= {
-        "path": parts(table["path"].tolist(), "n_steps"),
+        "path": parts(steps, "n_steps"),
         "starts": parts(table["start"].tolist(), "n_bounds"),
         "bound_status": parts(table["bound_status"].tolist(), "n_bounds"),
         "poses": ticks("pose"),

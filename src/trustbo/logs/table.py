@@ -7,14 +7,16 @@ import numpy as np
 import pandas as pd
 
 from trustbo.arrays import without_rounding
-from trustbo.data import FEATURES, SHARE_TOLERANCE, Mission
+from trustbo.data import FEATURES, POST_SETS, SHARE_TOLERANCE, Mission
 from trustbo.errors import TrustboError
 from trustbo.logs.columns import Columns, folded, require_one_spelling, require_plain_names
 from trustbo.stacking import require_same_team
 
 KEYS = ("mission", "bound", "robot")
 RATES = ("contact_rate", "duration", "n_ticks")
-COLUMNS = (*KEYS, "row", "col", *RATES, "status")
+POSTS = "posts"
+"""Column of the set of posts from which T2 watches the lead's move out of a cell."""
+COLUMNS = (*KEYS, "row", "col", POSTS, *RATES, "status")
 """Columns with a fixed meaning; other columns may be features of awareness."""
 TRUST = ("trust_mean", "trust_sd")
 """Columns of a posterior, which `export.write_csv` adds and `read_table` ignores."""
@@ -68,7 +70,7 @@ def to_frame(missions: Iterable[Mission]) -> pd.DataFrame:
             for i, robot in enumerate(mission.robots):
                 row: dict[str, Any] = dict(zip(KEYS, (j, k, robot), strict=True))
                 if mission.path:
-                    row["row"], row["col"] = mission.path[k]
+                    row["row"], row["col"], row[POSTS] = (*mission.path[k], POST_SETS[0])[:3]
                 if 1 <= k <= n_run:
                     bound = mission.bounds[k - 1]
                     row |= {name: getattr(bound, name)[i] for name in RATES}
@@ -76,7 +78,10 @@ def to_frame(missions: Iterable[Mission]) -> pd.DataFrame:
                     row |= dict(zip(mission.features, bound.awareness[i], strict=True))
                 rows.append(row)
 
-    names = [name for name in COLUMNS if missions[0].path or name not in ("row", "col")]
+    absent = set() if missions[0].path else {"row", "col"}
+    if all(len(station) == 2 for mission in missions for station in mission.path):
+        absent.add(POSTS)
+    names = [name for name in COLUMNS if name not in absent]
     return pd.DataFrame(rows, columns=[*names, *missions[0].features])
 
 
@@ -84,9 +89,10 @@ def read_table(table: Any) -> list[Mission]:
     """Read missions, without ticks, from a table with one row per mission, bound and robot.
 
     The columns are `mission`; `bound` (0 for the start cell, which has no measurements); `robot`;
-    the cell (`row`, `col`); and `contact_rate`. Optional columns are `duration` (s), `n_ticks` and
-    `status`. Other columns are features; without such columns, the features are `traversability`
-    and `visibility`, which then count as not measured. The status of the last bound is that of the
+    the cell (`row`, `col`); and `contact_rate`. Optional columns are `duration` (s), `n_ticks`,
+    `status`, and `posts`, the set of posts from which T2 watches the lead's move out of the cell.
+    Other columns are features; without such columns, the features are `traversability` and
+    `visibility`, which then count as not measured. The status of the last bound is that of the
     mission. An earlier bound has a status other than "ok" if it failed and the mission continued. A
     blank means "not measured", and a blank status means "ok". Bounds after the last one with a
     measurement were planned but not run. A table without `row` and `col` is a log without a map. If
@@ -135,6 +141,7 @@ def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:
     values: dict[str, Any] = {"mission": columns.texts("mission", blank=False)}
     require_one_spelling("column mission", values["mission"])
     values["robot"] = columns.texts("robot")
+    values[POSTS] = [text or POST_SETS[0] for text in columns.texts(POSTS, required=False)]
     values["status"] = [text.lower() for text in columns.texts("status", required=False)]
 
     is_mapped = any(columns.find(name) for name in ("row", "col"))
@@ -187,7 +194,7 @@ def _to_ticks(columns: Columns, rate: np.ndarray, n_ticks: np.ndarray) -> np.nda
 
 def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...]) -> Mission:
     """Make a mission from its rows."""
-    cells = rows.filter(["bound", "row", "col"]).drop_duplicates().sort_values("bound")
+    cells = rows.filter(["bound", "row", "col", POSTS]).drop_duplicates().sort_values("bound")
     is_mapped = "row" in cells
     numbers = cells["bound"].tolist()
     first = 0 if is_mapped else 1
@@ -228,7 +235,7 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
     rate, duration, n_ticks = np.moveaxis(arrays[..., : len(RATES)], -1, 0)
 
     return Mission.from_arrays(
-        cells[["row", "col"]].to_numpy().tolist() if is_mapped else None,
+        [*cells[["row", "col", POSTS]].itertuples(index=False, name=None)] if is_mapped else None,
         arrays[..., len(RATES) :],
         rate,
         duration,

@@ -16,12 +16,13 @@ _MOST = 4000  # maximum number of visited bounds, because the cost grows with it
 class Visited(NamedTuple):
     """Cells that missions entered and directed bounds that they took, without duplicates.
 
-    Places are sorted by map, row and column. Map 0 is that of the workspace.
+    A bound that was watched from several sets of posts is listed for each of its ways. Places are
+    sorted by map, row and column. Map 0 is that of the workspace.
     """
 
     shape: tuple[int, int]  # rows and columns of the workspace's grid
     cells: np.ndarray  # (cell, 2): row, col
-    bounds: np.ndarray  # (bound, 3): move, row, col
+    bounds: np.ndarray  # (bound, 3): way, row, col
     cell_of: np.ndarray  # (bound,), index of the cell entered
     at: np.ndarray  # (mission, bound), index of the visited bound, -1 in the padding
     cell_map: np.ndarray  # (cell,), number of the map
@@ -36,7 +37,7 @@ class Visited(NamedTuple):
 
 
 def bounds_of(missions: Sequence[Mission]) -> np.ndarray:
-    """Return an array (mission, bound, 3) of moves, rows and columns, with -1 in the padding.
+    """Return an array (mission, bound, 3) of ways, rows and columns, with -1 in the padding.
 
     Raises TrustboError if a path skips cells or a mission has no map.
     """

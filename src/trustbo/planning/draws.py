@@ -6,12 +6,13 @@ from functools import cached_property
 
 import numpy as np
 
-from trustbo.data import Cell
+from trustbo.data import Station
 from trustbo.errors import require_whole
 from trustbo.models.draws import Draws
 from trustbo.planning.objectives import capped
 from trustbo.planning.problem import EXACT, Problem
 from trustbo.planning.recursion import Recursion, states_along
+from trustbo.workspace.moves import cells_along
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +22,7 @@ class DrawnPaths:
     Attributes:
         problem: Planning problem.
         recursion: Recursion for expected trust, with leading axis (draw,).
-        paths: Flat indices of the cells on each path, shape (draw, cell), padded with -1.
+        paths: Stations of each path, shape (draw, cell); see `AdmissiblePaths.cells`.
     """
 
     problem: Problem
@@ -29,7 +30,7 @@ class DrawnPaths:
     paths: np.ndarray
 
     @cached_property
-    def candidates(self) -> list[tuple[Cell, ...]]:
+    def candidates(self) -> list[tuple[Station, ...]]:
         """Distinct best paths, the most frequent one first."""
         return [self.problem.paths.cells(path) for path in self._distinct[0]]
 
@@ -49,15 +50,15 @@ class DrawnPaths:
 
         return values
 
-    def values_of(self, paths: Sequence[Sequence[Cell]]) -> np.ndarray:
+    def values_of(self, paths: Sequence[Sequence[Station]]) -> np.ndarray:
         """Return the value of each given path under every draw, shape (draw, path)."""
         return np.stack([self._value(self.recursion, path) for path in paths], axis=1)
 
-    def regret(self, path: Sequence[Cell]) -> np.ndarray:
+    def regret(self, path: Sequence[Station]) -> np.ndarray:
         """Return the best value of each draw minus the value of the given path, shape (draw,)."""
         return np.maximum(0.0, self.values - self.values_of([path])[:, 0])
 
-    def relative_regret(self, path: Sequence[Cell]) -> np.ndarray:
+    def relative_regret(self, path: Sequence[Station]) -> np.ndarray:
         """Return the regret of a path relative to each draw's best value, shape (draw,).
 
         For lost_contact, the regret is divided by the contact that is kept on the best path: the
@@ -78,10 +79,12 @@ class DrawnPaths:
         """Return the fraction of draws whose best path contains each cell, shape (row, col)."""
         count = np.zeros(self.problem.paths.bounds.shape[1:])
         for path, n in zip(self.candidates, self.counts, strict=True):
-            count[tuple(np.array(path).T)] += n  # adds n once, even if a path enters the cell twice
+            count[tuple(cells_along(path).T)] += (
+                n  # adds n once, even if a path enters the cell twice
+            )
         return count / len(self.paths)
 
-    def _value(self, recursion: Recursion, path: Sequence[Cell]) -> np.ndarray:
+    def _value(self, recursion: Recursion, path: Sequence[Station]) -> np.ndarray:
         """Compute the value of a path for each draw of `recursion`, shape (draw,)."""
         problem = self.problem
         along = capped(problem.objective, problem.likelihood, recursion.along(path))

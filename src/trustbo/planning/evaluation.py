@@ -1,9 +1,11 @@
 """Trust, value, bands and risk of a given path."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell
+from trustbo.data import Station
 from trustbo.models.draws import Draws
 from trustbo.planning.objectives import capped
 from trustbo.planning.plan import QUANTILES, Plan
@@ -14,7 +16,7 @@ from trustbo.workspace.moves import along, bounds_along
 
 def evaluated(
     problem: Problem,
-    path: tuple[Cell, ...],
+    path: tuple[Station, ...],
     given: Draws,
     draws: Draws | None,
     x0: ArrayLike | None,
@@ -23,13 +25,12 @@ def evaluated(
 
     The bands are quantiles over `draws` or, if None, over the draws of `given`.
     """
-    cells = np.array(path)
-    cost = problem.failure_along(cells)
+    cost = problem.failure_along(path)
 
-    trust, value, values = _value_along(problem, cells, given, x0)
+    trust, value, values = _value_along(problem, path, given, x0)
     drawn = trust
     if draws is not None:
-        drawn, _, values = _value_along(problem, cells, draws, x0)
+        drawn, _, values = _value_along(problem, path, draws, x0)
 
     bands = np.repeat(drawn, len(QUANTILES), axis=0)
     value_band = None
@@ -48,26 +49,26 @@ def evaluated(
         limit=np.nan,
         seconds=0.0,
         workspace=problem.paths.workspace,
-        risk=None if problem.risk is None else problem.risk.along(cells),
-        infeasible=not problem.is_within_limit(cells),
+        risk=None if problem.risk is None else problem.risk.along(path),
+        infeasible=not problem.is_within_limit(path),
         value_band=value_band,
     )
 
 
 def _value_along(
-    problem: Problem, cells: np.ndarray, params: Draws, x0: ArrayLike | None
+    problem: Problem, path: Sequence[Station], params: Draws, x0: ArrayLike | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Compute trust (draw, bound, robot), the value of a path, and the value for each draw.
 
     The values do not include the expected cost of failure.
     """
     x0 = problem.initial_trust(x0)
-    z = along(problem.paths.workspace.awareness.values, cells)
-    bounds = bounds_along(cells)
+    z = along(problem.paths.workspace.awareness.values, path)
+    bounds = bounds_along(path)
 
     by_robot = trust_recursion(params, z, x0, bounds=bounds, by_robot=True)
     trust = states_along(by_robot)
-    bound_cost = problem.bound_cost_along(cells)
+    bound_cost = problem.bound_cost_along(path)
     values = problem.value_along(bound_cost, trust.mean(-1), by_robot.noise_sd)
     if not problem.objective.of_contact:
         value = problem.value_along(bound_cost, trust.mean((0, -1)), by_robot.noise_sd)

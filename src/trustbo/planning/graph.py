@@ -3,6 +3,7 @@
 import networkx as nx
 import numpy as np
 
+from trustbo.data import POST_SETS
 from trustbo.errors import TrustboError
 from trustbo.models.draws import Draws
 from trustbo.planning.objectives import LOST_CONTACT, capped
@@ -10,7 +11,7 @@ from trustbo.planning.paths import STEPS
 from trustbo.planning.problem import Problem, risk_of
 
 
-def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph:
+def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph | nx.MultiDiGraph:
     """Return the graph of `Planner.graph` for a single set of parameters."""
     recursion = problem.recursion(mean)
     radius = np.abs(np.linalg.eigvals(recursion.transition)).max()
@@ -23,8 +24,10 @@ def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph:
     contact = capped(LOST_CONTACT, problem.likelihood, recursion)
     workspace = problem.paths.workspace
     grid = workspace.grid
-    bounds = problem.paths.bounds
-    length = np.hypot(*(STEPS * (grid.cell_height, grid.cell_width)).T)  # (move,)
+    n_posts = workspace.n_posts
+    bounds = np.tile(problem.paths.bounds, (n_posts, 1, 1))
+    steps = np.tile(STEPS, (n_posts, 1))
+    length = np.hypot(*(steps * (grid.cell_height, grid.cell_width)).T)  # (way,)
 
     def of_bounds(values: np.ndarray) -> np.ndarray:
         return np.broadcast_to(values, bounds.shape)[bounds]
@@ -32,7 +35,8 @@ def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph:
     trust = of_bounds(recursion.steady_state()[0])
     of_contact = of_bounds(contact.steady_state()[0])
     rate = problem.likelihood.mean_rate(of_contact, recursion.noise_sd)
-    lost = of_bounds(problem.bound_cost) + np.maximum(1.0 - rate, 0.0)  # without rounding
+    bound_cost = np.tile(problem.bound_cost, (n_posts, 1, 1))
+    lost = of_bounds(bound_cost) + np.maximum(1.0 - rate, 0.0)  # without rounding
     cost, constant = problem.costs_of_bounds(trust, lost)
     values = {
         "length": of_bounds(length[:, None, None]),
@@ -42,13 +46,15 @@ def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph:
         "cost": cost,
     }
     if problem.risk is not None:
-        values["risk"] = of_bounds(risk_of(problem.risk.of_bounds))
+        values["risk"] = of_bounds(np.tile(risk_of(problem.risk.of_bounds), (n_posts, 1, 1)))
 
-    graph = nx.DiGraph(constant=constant)
+    graph = nx.DiGraph(constant=constant) if n_posts == 1 else nx.MultiDiGraph(constant=constant)
     for row, col in np.argwhere(workspace.passable.values).tolist():
         graph.add_node((row, col), x=float(grid.x[col]), y=float(grid.y[row]))
-    for k, (move, row, col) in enumerate(np.argwhere(bounds).tolist()):
-        origin = row - int(STEPS[move, 0]), col - int(STEPS[move, 1])
-        graph.add_edge(origin, (row, col), **{name: float(v[k]) for name, v in values.items()})
+    for k, (way, row, col) in enumerate(np.argwhere(bounds).tolist()):
+        origin = row - int(steps[way, 0]), col - int(steps[way, 1])
+        key = {} if n_posts == 1 else {"key": POST_SETS[way // len(STEPS)]}
+        attributes = {name: float(v[k]) for name, v in values.items()}
+        graph.add_edge(origin, (row, col), **key, **attributes)
 
     return graph

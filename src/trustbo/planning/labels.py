@@ -30,12 +30,10 @@ from trustbo.planning.limits import (
 )
 from trustbo.planning.sums import costs_of_sums
 from trustbo.planning.unrolled import Unrolled, kernel
-from trustbo.workspace.moves import MOVES
 
 MAX_LABELS = 300_000
 """Maximum number of labels. A search that needs more stops with the best path found so far and a
 lower limit."""
-_N_MOVES = len(MOVES)  # largest number of labels that extend one label
 _NO_CELL_YET = -2  # differs from all cells and from -1, the cell before the start
 
 
@@ -51,8 +49,8 @@ def best_labels(
         scale: Divisor of the cost of paths with each number of bounds, shape (length,).
 
     Returns:
-        Costs (draw,), lower bounds on the cost of any path (draw,), and paths (draw, cell) as flat
-        cell indices, padded with -1. A cost is inf if no path is within the limit.
+        Costs (draw,), lower bounds on the cost of any path (draw,), and paths (draw, cell) as
+        indices of stations, padded with -1. A cost is inf if no path is within the limit.
     """
     searches = [graph]
     divisor = scale[graph.n_bounds_left[graph.starts]]
@@ -105,9 +103,10 @@ def _best_path(graph, costs, max_labels, path):
         lower = _search(graph, costs, max_labels, edge_cost, limits, known)
 
     if known.cost[0] < np.inf:
-        path[0] = graph.cell[graph.starts[0]]
-    for k, e in enumerate(known.edges[: n - 1]):
-        path[k + 1] = graph.cell[graph.head[e]] if e >= 0 else -1
+        for k, e in enumerate(known.edges[: n - 1]):
+            if e >= 0:
+                path[k] = graph.station[e]
+                path[k + 1] = graph.cell[graph.head[e]]
 
     return known.cost[0], min(lower, known.cost[0])
 
@@ -154,7 +153,7 @@ def _search(graph, costs, max_labels, edge_cost, limits, known):
     for s in range(len(graph.cell) - 1, 0, -1):
         label = labels.last[s]
         while label >= 0:
-            if n + _N_MOVES > max_labels:
+            if n + graph.first[s + 1] - graph.first[s] > max_labels:
                 return limits.lower
             if not _is_dominated(graph, labels, label, labels.last[s], len(costs.failure)):
                 n = _extend(graph, costs, edge_cost, limits, known, labels, s, label, n)

@@ -7,6 +7,7 @@ from trustbo.models.draws import NextMission
 from trustbo.planning.draws import choose_draws, drawn_paths
 from trustbo.planning.problem import InfeasibleError, Problem
 from trustbo.planning.trust_map import cost_of, trust_map
+from trustbo.workspace.moves import cells_along
 
 
 def maps_of(
@@ -22,7 +23,7 @@ def maps_of(
         share = drawn_paths(problem, of_plans).share()
     except InfeasibleError as error:
         share = np.zeros(passable.shape)
-        share[tuple(np.array(error.path).T)] = 1.0
+        share[tuple(cells_along(error.path).T)] = 1.0
 
     maps = {
         "trust_mean": (trust.mean("draw"), "mean expected trust"),

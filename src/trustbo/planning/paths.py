@@ -9,12 +9,12 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from trustbo.data import Cell
+from trustbo.data import POST_SETS, Cell, Station, require_path
 from trustbo.errors import TrustboError, one_line, require_kind, require_whole
 from trustbo.planning.unrolled import Paired, Unrolled, paired
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import MOVES, moves_along, require_on_grid
+from trustbo.workspace.moves import MOVES, cells_along, moves_along, require_on_grid
 
 SIMPLE_EXTRA = 2
 """Largest number of bounds beyond the fewest for which all paths without U-turns are simple.
@@ -183,15 +183,20 @@ class AdmissiblePaths:
             fits = bounds[m, other] & (more >= 0) & (more < n_left[other])
             head[tail[fits], m] = rank[base[other[fits]] + more[fits]]
 
-        # Keep the edges that exist, sorted by the states that they leave.
-        tail, move = np.nonzero(head >= 0)
+        # Keep the edges that exist, sorted by the states that they leave; one for each set of
+        # posts.
+        n_posts = self.workspace.n_posts
+        tail, move = (np.repeat(index, n_posts) for index in np.nonzero(head >= 0))
         head = head[tail, move]
         first = np.searchsorted(tail, np.arange(n_states + 1))
-        bound = (move * rows * cols + cell[head]).astype(np.int32)
+
+        posts = np.arange(len(tail)) % n_posts
+        bound = ((posts * n_moves + move) * rows * cols + cell[head]).astype(np.int32)
+        station = (posts * rows * cols + cell[tail]).astype(np.int32)
 
         start = np.flatnonzero(near == 0)[0]
         starts = rank[base[start] : base[start + 1]]
-        return Unrolled(cell, n_bounds_left, first, head, bound, starts, self.turns)
+        return Unrolled(cell, n_bounds_left, first, head, bound, station, starts, self.turns)
 
     @cached_property
     def paired(self) -> Paired:
@@ -246,20 +251,23 @@ class AdmissiblePaths:
             self.workspace, self.start, cell, admitted, self.avoided, self.blocked
         )
 
-    def cells(self, flat: np.ndarray) -> tuple[Cell, ...]:
-        """Convert flat indices to cells; negative indices are padding and are dropped."""
-        rows, cols = np.divmod(flat[flat >= 0], self.bounds.shape[-1])
-        return tuple(zip(rows.tolist(), cols.tolist(), strict=True))
+    def cells(self, flat: np.ndarray) -> tuple[Station, ...]:
+        """Convert flat indices of `Unrolled.station` to a path; negative indices are padding."""
+        posts, rows, cols = np.unravel_index(
+            flat[flat >= 0], (self.workspace.n_posts, *self.bounds.shape[1:])
+        )
+        stations = zip(rows.tolist(), cols.tolist(), posts.tolist(), strict=True)
+        return require_path("path", [(row, col, POST_SETS[k]) for row, col, k in stations])
 
-    def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
+    def require_path(self, path: Sequence[Station]) -> tuple[Station, ...]:
         """Check that a path leads from start to goal and return it as a tuple of cells.
 
         Raises:
             TrustboError: If the robots cannot drive a bound, or the path does not lead from start
                 to goal.
         """
-        cells = tuple(require_on_grid(path, self.bounds.shape[1:]))
-        if len(cells) < 2 or (cells[0], cells[-1]) != (self.start, self.goal):
+        cells = require_on_grid(path, self.bounds.shape[1:])
+        if len(cells) < 2 or (cells[0][:2], cells[-1][:2]) != (self.start, self.goal):
             raise TrustboError(
                 f"a path must lead from {self.start} to {self.goal}; got {one_line(list(cells))}."
             )
@@ -268,13 +276,14 @@ class AdmissiblePaths:
         if self.blocked is not None:
             drivable = drivable & ~self.blocked
 
-        entered = np.array(cells[1:]).T
+        self.workspace.along(cells, anywhere=True)  # refuses sets of posts that are not offered
+        entered = cells_along(cells)[1:].T
         broken = ~drivable[moves_along(cells), *entered]
         if broken.any():
             k = int(np.argmax(broken))
             raise TrustboError(
-                f"no bound leads from {cells[k]} to {cells[k + 1]}: a cell is impassable, no "
-                "route connects the cells, or the bound is blocked. Give another path."
+                f"no bound leads from {cells[k][:2]} to {cells[k + 1][:2]}: a cell is impassable, "
+                "no route connects the cells, or the bound is blocked. Give another path."
             )
 
         return cells

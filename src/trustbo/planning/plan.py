@@ -10,10 +10,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import pandas as pd
 
-from trustbo.data import Cell, path_text
+from trustbo.data import POST_SETS, Cell, Station, path_text
 from trustbo.display import Rows, Summary, joined
 from trustbo.hazard.path_risk import PathRisk
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import cells_along, posts_along
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
 """Quantile levels of `Plan.bands`: the ends of the 90 % and the 50 % bands."""
@@ -48,7 +49,9 @@ class Plan(Summary):
     workspace has no terrain, these properties are None.
 
     Attributes:
-        path: Cells from start to goal.
+        path: Cells from start to goal, each (row, col), or (row, col, name) if T2 watches the
+            lead's move out of the cell from another set of posts than the standard one; see
+            `Workspace.from_terrain`.
         trust: Expected trust after each bound, shape (bound, robot).
         bands: Quantiles of expected trust over the parameter draws, shape (quantile, bound, robot),
             for the levels in `QUANTILES`. With one draw, the bands equal `trust`.
@@ -82,7 +85,7 @@ class Plan(Summary):
         >>> plan.trust.mean(axis=0)  # of each robot
     """
 
-    path: tuple[Cell, ...]
+    path: tuple[Station, ...]
     trust: np.ndarray
     bands: np.ndarray
     value: float
@@ -131,6 +134,8 @@ class Plan(Summary):
 
         - `cell`: cell as text, such as "9,0".
         - `x`, `y`: stop of the lead or, without a terrain, centre of the cell, in CRS metres.
+        - `posts`: set of posts from which T2 watches the lead's move out of the cell; left out if
+          the workspace has one set.
         - `trust`, `trust_low`, `trust_high`: expected trust after the bound and the ends of its
           90 % interval, means of the robots.
         - `driven`: whether the bound had been driven when the mission was replanned.
@@ -153,7 +158,9 @@ class Plan(Summary):
 
         places = self.positions if self.stops is None else self.stops
         table = pd.DataFrame(places, columns=["x", "y"]).rename_axis("bound")
-        table.insert(0, "cell", [path_text([cell]) for cell in self.path])
+        table.insert(0, "cell", [path_text([cell[:2]]) for cell in self.path])
+        if self.workspace.n_posts > 1:
+            table["posts"] = [*map(POST_SETS.__getitem__, posts_along(self.path)), ""]
         return table.join(pd.DataFrame(of_bounds, index=table.index[1:]))
 
     def _trust_columns(self, name: str, robots: slice) -> dict[str, np.ndarray]:
@@ -165,7 +172,7 @@ class Plan(Summary):
     def positions(self) -> np.ndarray:
         """CRS coordinates x and y of the cell centres, shape (cell, 2), in metres."""
         grid = self.workspace.grid
-        rows, cols = np.array(self.path).T
+        rows, cols = cells_along(self.path).T
         return np.stack([grid.x[cols], grid.y[rows]], axis=1)
 
     @property
@@ -176,7 +183,7 @@ class Plan(Summary):
     @property
     def revisits(self) -> int:
         """Number of bounds that enter a cell that the path has already visited."""
-        return len(self.path) - len(set(self.path))
+        return len(self.path) - len({cell[:2] for cell in self.path})
 
     @property
     def is_replanned(self) -> bool:
@@ -246,7 +253,7 @@ def past_failures_of(plan: Plan) -> list[str]:
     ways: dict[int, dict[Any, list[PastFailure]]] = {}
     for failure in plan.past_failures:
         k = failure.bound
-        same = failure.way[0] == plan.path[k - 1] and math.isclose(
+        same = failure.way[0] == plan.path[k - 1][:2] and math.isclose(
             failure.p_fail, p_fail[k - 1], rel_tol=_ROUNDING
         )
         way = None if same else (failure.way, failure.p_fail)
@@ -254,7 +261,7 @@ def past_failures_of(plan: Plan) -> list[str]:
 
     texts = []
     for k, of_bound in ways.items():
-        left, entered = plan.path[k - 1 : k + 1]
+        left, entered = (cell[:2] for cell in plan.path[k - 1 : k + 1])
         text = f"bound {k} enters {path_text([entered])} from {path_text([left])} with failure "
         text += f"probability {p_fail[k - 1]:.2g}{_when(of_bound.pop(None))}"
         for (way, failed), failures in of_bound.items():

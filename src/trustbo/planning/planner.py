@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled
-from trustbo.data import Cell
+from trustbo.data import POST_SETS, Cell, Station
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
     TrustboError,
@@ -193,7 +193,7 @@ class Planner(Summary):
         rest = AdmissiblePaths(paths.workspace, cell, self.goal, max_bounds, blocked=closed)
         return self._with(paths=rest, x0=self.problem.initial_trust(x0))
 
-    def require_path(self, path: Sequence[Cell]) -> tuple[Cell, ...]:
+    def require_path(self, path: Sequence[Station]) -> tuple[Station, ...]:
         """Check that a path leads from start to goal and return it as a tuple of cells."""
         return self.problem.paths.require_path(path)
 
@@ -285,7 +285,7 @@ class Planner(Summary):
         limit = plan.value if exact else float(self.problem.objective.value(limits[0]))
         return replace(plan, exact=exact, limit=limit, seconds=seconds)
 
-    def best_path(self, recursion: Recursion) -> tuple[Cell, ...]:
+    def best_path(self, recursion: Recursion) -> tuple[Station, ...]:
         """Find the best admissible path for a given recursion, such as one with optimistic drifts.
 
         Args:
@@ -319,7 +319,7 @@ class Planner(Summary):
 
     @computing()
     def evaluate(
-        self, path: Sequence[Cell], params: Draws | xr.DataTree, *, x0: ArrayLike | None = None
+        self, path: Sequence[Station], params: Draws | xr.DataTree, *, x0: ArrayLike | None = None
     ) -> Plan:
         """Return a plan for a given path, with `exact` False and `limit` NaN.
 
@@ -341,8 +341,11 @@ class Planner(Summary):
         return evaluated(self.problem, path, draws, None, x0)
 
     @computing()
-    def graph(self, params: Draws | xr.DataTree) -> nx.DiGraph:
+    def graph(self, params: Draws | xr.DataTree) -> nx.DiGraph | nx.MultiDiGraph:
         """Return the cells and bounds as a networkx graph.
+
+        With several sets of posts, the graph is a multigraph, in which the names of the sets are
+        the keys of parallel edges.
 
         Nodes are the passable cells `(row, col)`, with the CRS coordinates `x` and `y` of their
         centres in metres. Edges are the bounds, with the attributes
@@ -391,6 +394,7 @@ class Planner(Summary):
         cell: Location | None = None,
         *,
         move: str | None = None,
+        posts: str = POST_SETS[0],
         as_rate: bool = False,
         expected: bool = False,
     ) -> xr.DataArray:
@@ -409,6 +413,7 @@ class Planner(Summary):
                 `Workspace.locate`); by default all cells.
             move: Direction of the bound that enters the cell, such as `"ne"` (see
                 `workspace.MOVE_NAMES`); by default the mean over all directions.
+            posts: Set of posts from which T2 watches; see `Workspace.post_sets`.
             as_rate: Whether to return the expected contact rate at this trust, in [0, 1]. The mean
                 of Gaussian contact rates is trust, limited to [0, 1]. For the family
                 `"beta_binomial"`, trust is the logit of the contact rate.
@@ -421,8 +426,8 @@ class Planner(Summary):
             enters a cell and, with a warning, for draws in which trust diverges.
 
         Raises:
-            TrustboError: If the robot or move is unknown, the cell is off the grid or impassable,
-                no such bound enters the cell, or trust diverges in all draws.
+            TrustboError: If the robot, move or set of posts is unknown, the cell is off the grid or
+                impassable, no such bound enters the cell, or trust diverges in all draws.
 
         Example:
             >>> planner.trust(posterior, "r2", (3, 4)).quantile([0.05, 0.5, 0.95])
@@ -430,7 +435,8 @@ class Planner(Summary):
         self.problem.require_family(params, uses_rates=as_rate)
         draws = draws_of(params, self.workspace).of_robots(expected=expected)
         family = self.problem.likelihood
-        return robot_trust(self.workspace, family, draws, robot, cell, move=move, as_rate=as_rate)
+        about = {"move": move, "posts": posts, "as_rate": as_rate}
+        return robot_trust(self.workspace, family, draws, robot, cell, **about)
 
     @computing()
     def robot_maps(self, posterior: Draws | xr.DataTree, *, expected: bool = False) -> xr.Dataset:

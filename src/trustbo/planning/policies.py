@@ -11,9 +11,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from trustbo.data import Cell
+from trustbo.data import Station, require_path
 from trustbo.errors import (
-    require_cells,
     require_choice,
     require_finite,
     require_kind,
@@ -105,7 +104,7 @@ def explore(
     params: Draws,
     planner: Planner,
     *,
-    driven: Sequence[Sequence[Cell]] = (),
+    driven: Sequence[Sequence[Station]] = (),
     regret: float = 0.02,
     doubt: float = 0.1,
 ) -> Plan:
@@ -133,7 +132,7 @@ def explore(
     require_share("regret", regret)
     require_share("doubt", doubt)
 
-    last = [require_cells("a path in driven", path) for path in driven[-_N_REPEATED:]]
+    last = [require_path("a path in driven", path) for path in driven[-_N_REPEATED:]]
     if last != [plan.path] * _N_REPEATED:
         return plan
 
@@ -154,7 +153,7 @@ def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
 
     recursion = Recursion(
         transition=np.zeros((1, 1, 1)),
-        drift=rng.uniform(size=(1, 1, *planner.problem.paths.bounds.shape)),
+        drift=rng.uniform(size=(1, 1, *planner.workspace.awareness.shape[1:-1])),
         start=np.zeros((1, 1)),
         noise_sd=np.full(1, 0.1),  # matters only for censored rates
     )
@@ -186,7 +185,7 @@ def choose_plan(
     rng: np.random.Generator,
     params: Draws,
     planner: Planner,
-    driven: Sequence[Sequence[Cell]],
+    driven: Sequence[Sequence[Station]],
 ) -> Plan:
     """Call a policy, and pass it the paths of all missions if it has a parameter `driven`."""
     if "driven" in inspect.signature(policy).parameters:
@@ -194,7 +193,7 @@ def choose_plan(
     return policy(rng, params, planner)
 
 
-def _most_promising(drawn: DrawnPaths, kappa: float) -> tuple[Cell, ...]:
+def _most_promising(drawn: DrawnPaths, kappa: float) -> tuple[Station, ...]:
     """Return the candidate with the largest mean + `kappa` sd of its value over the draws."""
     values = drawn.values_of(drawn.candidates)
     chosen = int(np.argmax(values.mean(0) + kappa * values.std(0)))

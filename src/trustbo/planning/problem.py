@@ -23,7 +23,7 @@ from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.recursion import Recursion, trust_recursion
 from trustbo.planning.sums import best_sums
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import END, MOVE_NAMES, NEXT_NAMES, bounds_along, possible_next
+from trustbo.workspace.moves import END, MOVE_NAMES, NEXT_NAMES, bounds_and_next, possible_next
 
 EXACT = 1e-12
 """Tolerance: a path is optimal if its score is within this distance of the upper limit."""
@@ -136,7 +136,7 @@ class Problem:
 
     def bound_cost_along(self, path: Sequence[Cell] | np.ndarray) -> float:
         """Sum the costs of the bounds of a path."""
-        return float(self.bound_cost[*bounds_along(path).T].sum())
+        return float(self.bound_cost[*bounds_and_next(path).T[:3]].sum())
 
     def value_along(self, bound_cost: float, trust: np.ndarray, noise_sd: np.ndarray) -> np.ndarray:
         """Compute the value of a path, shape (...,), assuming that no bound fails.
@@ -164,7 +164,8 @@ class Problem:
         """Compute the costs of all bounds as if trust were not carried over; see `Planner.graph`.
 
         Args:
-            trust: The team's trust after each bound of `paths.bounds`, shape (bound,).
+            trust: The team's trust after each bound of `paths.bounds`, for each set of posts in
+                turn, shape (bound,).
             lost: Contact lost in each bound plus the bound cost, shape (bound,).
 
         Returns:
@@ -172,13 +173,15 @@ class Problem:
             The score of a path is c - (sum of costs), or c - (sum of costs) / n if it is a mean
             over n bounds.
         """
-        bounds = self.paths.bounds
+        n_posts = self.paths.workspace.n_posts
+        bounds = np.tile(self.paths.bounds, (n_posts, 1, 1))
         if self.objective.of_contact:
             if self.risk is None:
                 return lost, 0.0
-            return lost + self.cost_of_failure * np.nan_to_num(self.risk.of_bounds[bounds]), 0.0
+            p_fail = np.tile(np.nan_to_num(self.risk.of_bounds), (n_posts, 1, 1))
+            return lost + self.cost_of_failure * p_fail[bounds], 0.0
 
-        bound_cost = self.bound_cost[bounds]
+        bound_cost = np.tile(self.bound_cost, (n_posts, 1, 1))[bounds]
         credit = self.objective.credit(np.arange(self.paths.longest + 1))
         if credit[1:].any():
             cost = bound_cost - trust
@@ -252,8 +255,9 @@ class Problem:
         """Find the best admissible path for each draw of the recursion.
 
         Returns:
-            Scores (draw,), upper limits on the score of any path (draw,), and paths (draw, cell) as
-            flat cell indices, padded with -1. The limits equal the scores if the search is exact.
+            Scores (draw,), upper limits on the score of any path (draw,), and paths (draw, cell),
+            as `AdmissiblePaths.cells` reads them. The limits equal the scores if the search is
+            exact.
 
         Raises:
             TrustboError: If beta0 is outside the range in which the search is exact.
@@ -266,7 +270,7 @@ class Problem:
         graph = self.paths.graph if self.edge_risks is None else self.paths.paired.graph
         n_draws, n_states = recursion.start.shape
         drift = recursion.drift.reshape(n_draws, n_states, -1)
-        bound_cost = self.bound_cost.ravel()
+        bound_cost = np.tile(self.bound_cost.ravel(), self.paths.workspace.n_posts)
         state_weights = np.full(n_states, 1.0 / n_states)
         weights = weights_of(self.objective, recursion, state_weights, graph.longest)
 
@@ -312,7 +316,7 @@ class Problem:
         paired = self.paths.paired
         graph = paired.graph
         p_fail, weights = cast("Risk", self.risk).searched
-        n_bounds = self.bound_cost.size
+        n_bounds = self.bound_cost.size * self.paths.workspace.n_posts
         n = graph.longest + 1
 
         # No bound costs anything, and a failure costs 1.

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
+from trustbo.data import POST_SETS
 from trustbo.errors import TrustboError, require_choice, warn
 from trustbo.models.draws import Draws
 from trustbo.models.families import Family
@@ -29,7 +30,7 @@ class Bounds(NamedTuple):
 
     Attributes:
         workspace: Workspace of the bounds.
-        which: Moves, rows and columns, shape (bound, 3).
+        which: Ways, rows and columns, shape (bound, 3).
         awareness: Awareness of the bounds, shape (robot, bound, feature).
         target: Index of the place to which the mean over bounds is assigned, shape (bound,).
         n_targets: Number of places, such as the cells of the map.
@@ -61,13 +62,14 @@ def robot_trust(
     cell: Location | None = None,
     *,
     move: str | None = None,
+    posts: str = POST_SETS[0],
     as_rate: bool = False,
 ) -> xr.DataArray:
     """Compute stationary trust in robots at cells; see `Planner.trust`."""
     names = workspace.team.names
     if robot is not None:
         require_choice("robot", robot, names)
-    bounds = _bounds_of(workspace, cell, move)
+    bounds = _bounds_of(workspace, cell, move, posts)
 
     chosen = list(names) if robot is None else [robot]
     index = [names.index(name) for name in chosen]
@@ -101,7 +103,7 @@ def robot_trust(
 
 def robot_maps(workspace: Workspace, family: Family, draws: Draws) -> xr.Dataset:
     """Summarise stationary trust in each robot over draws; see `Planner.robot_maps`."""
-    bounds = _bounds_of(workspace, None, None)
+    bounds = _bounds_of(workspace, None, None, POST_SETS[0])
     shape = (workspace.team.n_robots, bounds.n_targets)
     first = None
     total = np.zeros(shape)
@@ -144,13 +146,14 @@ def robot_maps(workspace: Workspace, family: Family, draws: Draws) -> xr.Dataset
     return workspace.grid.place(dataset)
 
 
-def _bounds_of(workspace: Workspace, cell: Location | None, move: str | None) -> Bounds:
+def _bounds_of(workspace: Workspace, cell: Location | None, move: str | None, posts: str) -> Bounds:
     """Find the bounds that enter a cell (or any cell) by a move (or by any move).
 
     Raises:
-        TrustboError: If the move is unknown, the cell is off the grid or impassable, or no such
-            bound enters the cell.
+        TrustboError: If the move or the set of posts is unknown, the cell is off the grid or
+            impassable, or no such bound enters the cell.
     """
+    require_choice("posts", posts, workspace.post_sets)
     exists = workspace.passable_bounds.values
     if move is not None:
         require_choice("move", move, MOVE_NAMES)
@@ -176,6 +179,7 @@ def _bounds_of(workspace: Workspace, cell: Location | None, move: str | None) ->
         target = which[:, 1] * exists.shape[2] + which[:, 2]  # flat index of the cell
         n_targets = exists[0].size
 
+    which[:, 0] += len(MOVE_NAMES) * POST_SETS.index(posts)
     awareness = workspace.awareness.values[:, *which.T]
     return Bounds(workspace, which, awareness, target, n_targets)
 

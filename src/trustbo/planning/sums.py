@@ -24,7 +24,8 @@ def best_sums(
         bound_cost: Additional cost of each bound, shape (bound,).
 
     Returns:
-        Scores (draw,) and paths (draw, cell) as flat cell indices, padded with -1.
+        Scores (draw,) and paths (draw, cell) as indices of stations, padded with -1; the last one
+        is the goal.
     """
     n = len(drift)
     scores = np.full(n, -np.inf)
@@ -58,9 +59,9 @@ def _best_sums(graph, drift, per_bound, constant, scale, bound_cost, scores, pat
 
         if chosen >= 0:
             n = edges_from(graph, to_go, chosen, edges)
-            paths[d, 0] = graph.cell[chosen]
             for k in range(n):
-                paths[d, k + 1] = graph.cell[graph.head[edges[k]]]
+                paths[d, k] = graph.station[edges[k]]
+            paths[d, n] = graph.cell[0]
 
 
 @kernel

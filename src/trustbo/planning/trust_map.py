@@ -50,13 +50,14 @@ def _largest(paths: AdmissiblePaths, recursion: Recursion, state_weights: np.nda
     scalar = (weights == beta0.max(-1, keepdims=True) * state_weights).all()
     if scalar and (beta0 >= 0.0).all():
         drift = np.einsum("s,dsmrc->dmrc", state_weights, recursion.drift)
+        drift = drift.reshape(len(drift), -1, *paths.bounds.shape).max(1)  # of the best posts
         drift = np.where(paths.bounds, drift, np.nan)
         return best_trust(paths, extra, drift, beta0.max(-1), recursion.start @ state_weights)
 
     # Otherwise, search once for each cell.
     drift = recursion.drift.reshape(*recursion.start.shape, -1)
     values = np.full((len(drift), *paths.bounds.shape[1:]), np.nan)
-    no_cost = np.zeros(paths.bounds.size)
+    no_cost = np.zeros(drift.shape[-1])
     for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
         graph = paths.to((row, col), extra).graph
         weights = weights_of(TERMINAL, recursion, state_weights, graph.longest)

@@ -25,7 +25,10 @@ class Unrolled(NamedTuple):
         n_bounds_left: Number of bounds left in each state, shape (state,); state 0 is the goal.
         first: Index of the first edge that leaves each state, followed by the number of edges.
         head: State to which each edge leads, shape (edge,).
-        bound: Flat index move * cells + cell of the bound of each edge, shape (edge,).
+        bound: Flat index way * cells + cell of the bound of each edge, shape (edge,). With several
+            sets of posts, successive edges lead to the same state by the same move.
+        station: Flat index posts * cells + cell of the set of posts and the cell that each edge
+            leaves, shape (edge,).
         starts: Index of the start state of each path length, ascending, shape (length,).
         turns: Whether U-turns are allowed.
     """
@@ -35,6 +38,7 @@ class Unrolled(NamedTuple):
     first: np.ndarray
     head: np.ndarray
     bound: np.ndarray
+    station: np.ndarray
     starts: np.ndarray
     turns: bool
 
@@ -85,7 +89,8 @@ def paired(graph: Unrolled, n_cells: int) -> Paired:
         n_cells: Number of cells of the grid.
     """
     n_moves = END
-    move = graph.bound // n_cells  # move of each edge
+    way, entered = np.divmod(graph.bound.astype(np.int64), n_cells)
+    move = way % n_moves  # move of each edge; risks do not depend on the posts
 
     # The key of a state is `number of the plain state` x 9 + `move that led there`, where 8 stands
     # for the start. These keys keep the order of the states. All ways to enter the goal form one
@@ -111,15 +116,16 @@ def paired(graph: Unrolled, n_cells: int) -> Paired:
     left = graph.cell[plain_state[tail]]  # the cell in which the bound before the edge ended
     by = came_by[tail]
     completed = np.where(by < n_moves, (by * n_cells + left) * width + move[edge], -1)
-    bound = graph.bound[edge]
-    last = np.where(head == 0, bound.astype(np.int64) * width + END, -1)
+    own = (move[edge] * n_cells + entered[edge]) * width + END
+    last = np.where(head == 0, own, -1)
 
     whole = Unrolled(
         cell=graph.cell[plain_state],
         n_bounds_left=graph.n_bounds_left[plain_state],
         first=first,
         head=head,
-        bound=bound,
+        bound=graph.bound[edge],
+        station=graph.station[edge],
         starts=np.searchsorted(keys, begun).astype(graph.starts.dtype),
         turns=True,
     )
@@ -129,8 +135,8 @@ def paired(graph: Unrolled, n_cells: int) -> Paired:
 class ToGo(NamedTuple):
     """Costs (state,) and first edges (state,) of the best and second-best paths to the goal.
 
-    The best path has the cost `least` and the first edge `edge`. The second-best path, with another
-    first edge, has `second` and `other`. A forbidden U-turn excludes at most one first edge.
+    The best path has the cost `least` and the first edge `edge`. The second-best path, which first
+    enters another cell, has `second` and `other`. A forbidden U-turn excludes one cell.
     """
 
     least: np.ndarray
@@ -166,12 +172,15 @@ def fill_to_go(graph, cost, to_go) -> None:
             if not graph.turns and edge[h] >= 0 and cell[head[edge[h]]] == cell[s]:
                 value = cost[e] + second[h]  # the best path from h would be a U-turn
 
+            # Edges that enter the same state are successive and differ in their posts.
+            again = at >= 0 and head[at] == h
             if value < low:
-                next_low = low
-                at_next = at
+                if not again:
+                    next_low = low
+                    at_next = at
                 low = value
                 at = e
-            elif value < next_low:
+            elif value < next_low and not again:
                 next_low = value
                 at_next = e
 

@@ -24,6 +24,7 @@ from trustbo.plots.maps import (
 )
 from trustbo.plots.style import robot_looks
 from trustbo.workspace.grid import Grid
+from trustbo.workspace.moves import cells_along
 
 _PLANNED_ON = "trust map used to plan the mission"
 _BOKEH_MARKERS = {"o": "circle", "s": "square", "D": "diamond", "^": "triangle",
@@ -94,7 +95,7 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
     from bokeh.resources import INLINE
 
     n = history.sizes["iteration"]
-    start, goal = (path_text([cell]) for cell in (plan.path[0], plan.path[-1]))
+    start, goal = (path_text([plan.path[k][:2]]) for k in (0, -1))
     title = f"Path from {start} to {goal} after {n} {'mission' if n == 1 else 'missions'}"
     html = file_html(_layout(plan, maps, history), INLINE, title=title)
     viewport = '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -207,7 +208,7 @@ def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.n
     }
     for i, trust in history["trust_map"].groupby("iteration"):
         values = shown_values(trust.squeeze("iteration"), workspace)
-        values[plan.path[0]] = np.nan  # assumed
+        values[plan.path[0][:2]] = np.nan  # assumed
         layers[f"mission {i}"] = values
     return layers
 
@@ -240,7 +241,7 @@ def _looks(layers: dict[str, np.ndarray], maps: xr.Dataset) -> dict[str, Any]:
 def _draw_plan(plot: Any, plan: Plan) -> None:
     """Plot the recommended path and, with a terrain, the posts and routes of the robots."""
     grid = plan.workspace.grid
-    path = _places(plan.path, grid)
+    path = _places(cells_along(plan.path), grid)
     for colour, width in (("black", 5), ("white", 3)):
         plot.line(**path, color=colour, line_width=width, legend_label="recommended")
     for k, marker in ((0, "circle"), (-1, "star")):

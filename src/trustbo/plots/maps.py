@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from scipy.ndimage import gaussian_filter
 
-from trustbo.data import Cell
+from trustbo.data import Cell, Station
 from trustbo.errors import TrustboError, require_kind, require_list, require_tuple, require_whole
 from trustbo.plots.style import (
     GREY,
@@ -33,7 +33,7 @@ from trustbo.plots.style import (
 )
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid
-from trustbo.workspace.moves import require_on_grid
+from trustbo.workspace.moves import cells_along, require_on_grid
 
 MOMENTS = (1, 2, 4)
 """Missions for which `trust_maps` plots the map used for planning, by default."""
@@ -123,7 +123,7 @@ def trust_maps(
     require_kind("trust_map", trust_map, xr.DataArray, "give Result.trust_map")
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
 
-    path = require_path_of_cells(path, workspace)
+    recommended = require_path_of_cells(path, workspace)
     n_missions = history.sizes["iteration"]
     if missions is None:
         chosen = [i for i in MOMENTS if i <= n_missions]
@@ -135,7 +135,7 @@ def trust_maps(
     maps = np.stack(
         [shown_values(values, workspace) for values in [*planned["trust_map"], trust_map]]
     )
-    paths = [*map(cells_of, planned["path"].values), np.array(path)]
+    paths = [*map(cells_of, planned["path"].values), recommended]
     learned = [*(i - 1 for i in chosen), n_missions]
 
     maps[:, *path[0]] = np.nan
@@ -261,15 +261,14 @@ def cell_map(
         norm.vmin, norm.vmax = limits_of(shown, (0.0, 1.0), is_trust=is_trust(name))
     if label is not None:
         require_kind("label", label, str, "give a text; '' for no colour bar")
-    if path is not None:
-        path = require_path_of_cells(path, workspace)
+    cells = None if path is None else require_path_of_cells(path, workspace)
 
     axes = map_panels(workspace.grid, 1, ax)
     good = BRIGHT_HIGH if is_good_high(name) else BRIGHT_LOW
     image = draw_cells(axes[0], shown, workspace, norm, cmap or good)
 
-    if path is not None:
-        draw_path(axes[0], path, workspace.grid)
+    if cells is not None:
+        draw_path(axes[0], cells, workspace.grid)
     if label == "":
         return axes[0]
 
@@ -338,12 +337,15 @@ def is_good_high(name: str) -> bool:
     return name != "cost" and not name.endswith(("_sd", " sd"))
 
 
-def require_path_of_cells(path: Sequence[Cell], workspace: Workspace) -> list[Cell]:
-    """Return the cells of a path; raises TrustboError if there are none or one is off the grid."""
+def require_path_of_cells(path: Sequence[Station], workspace: Workspace) -> np.ndarray:
+    """Return the cells of a path, shape (cell, 2).
+
+    Raises TrustboError if there are none, or if one is off the grid.
+    """
     cells = require_on_grid(path, workspace.grid.shape)
     if not cells:
         raise TrustboError("path must contain at least one cell; got none.")
-    return cells
+    return cells_along(cells)
 
 
 def cells_of(steps: np.ndarray) -> np.ndarray:

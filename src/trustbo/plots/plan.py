@@ -9,6 +9,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from trustbo.data import path_text
 from trustbo.errors import TrustboError, require_kind, require_list, require_whole
 from trustbo.planning import Plan
 from trustbo.plots.maps import draw_contours, draw_path, draw_scale, extent_of, set_frame
@@ -23,6 +24,7 @@ from trustbo.plots.style import (
     styled,
 )
 from trustbo.workspace import Workspace
+from trustbo.workspace.moves import cells_along
 
 _VEGETATION = (0.44, 0.56, 0.39, 0.4)
 """Colour of vegetation: a semi-transparent green for light and dark backgrounds."""
@@ -72,14 +74,14 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     axes = panels(1 + len(shown), ax, size)
     for panel in axes:
         draw_ground(panel, plan.workspace)
-    draw_path(axes[0], plan.path, plan.workspace.grid)
+    draw_path(axes[0], cells_along(plan.path), plan.workspace.grid)
     axes[0].set_title(f"path of {n_bounds} bounds")
     draw_scale(axes[0])
 
     for panel, k in zip(axes[1:], shown, strict=True):
         _draw_bound(panel, plan, k)
-        (a, b), (c, d) = plan.path[k - 1 : k + 1]
-        panel.set_title(f"bound {k}\n{a},{b} to {c},{d}")
+        ends = (path_text([station]) for station in plan.path[k - 1 : k + 1])
+        panel.set_title(f"bound {k}\n{' to '.join(ends)}")
 
     names = plan.workspace.team.names
     if len(shown):

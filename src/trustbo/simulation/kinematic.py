@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Cell, Mission
+from trustbo.data import Mission, Station
 from trustbo.errors import TrustboError, require_kind, require_list, require_positive, require_whole
 from trustbo.simulation.events import Event
 from trustbo.simulation.motion import drive_together
@@ -30,7 +30,7 @@ _T2 = slice(1, None)
 class State(NamedTuple):
     """State of the team between two bounds; positions in CRS metres, headings in rad."""
 
-    cell: Cell
+    cell: Station
     """Cell of the lead."""
     poses: np.ndarray
     """Position and heading of each robot, the lead first, shape (1 + robot, 3)."""
@@ -146,7 +146,7 @@ class KinematicSimulator(DescribedSimulator):
                 world = event.change(world)
         return world
 
-    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
+    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
         """Run a path to the goal or until a bound fails.
 
         Args:
@@ -185,7 +185,7 @@ class KinematicSimulator(DescribedSimulator):
         )
         return dataclasses.replace(measured, poses=poses, contact=contacts)
 
-    def standing(self, cell: Cell, next_cell: Cell | None) -> State:
+    def standing(self, cell: Station, next_cell: Station | None) -> State:
         """Return the state of a team that stands at the stop and the posts of a cell."""
         posts = self._posts
         stops = np.concatenate([posts.stop(cell)[None], posts.watching(cell, next_cell)])
@@ -224,8 +224,8 @@ class KinematicSimulator(DescribedSimulator):
         world: World,
         state: State,
         k: int,
-        cell: Cell,
-        ahead: Sequence[Cell | None],
+        cell: Station,
+        ahead: Sequence[Station | None],
         rng: np.random.Generator,
         *,
         expected: bool = False,
@@ -281,7 +281,7 @@ class KinematicSimulator(DescribedSimulator):
         self,
         world: World,
         state: State,
-        cell: Cell,
+        cell: Station,
         members: slice,
         goals: np.ndarray,
         max_ticks: int,

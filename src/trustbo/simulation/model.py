@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled
-from trustbo.data import Cell, Mission
+from trustbo.data import Mission, Station
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.hazard.given import read_risk
 from trustbo.models import PooledTrust
@@ -89,7 +89,7 @@ class ModelSimulator(DescribedSimulator):
 
         self.p_fail = None if p_fail is None else _require_probabilities(p_fail, shape[1:4])
 
-    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
+    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
         """Run a path; the result depends on the seed, but not on the number of the mission."""
         cells = require_path(self.workspace, path)
         z = along(self.awareness, cells)  # (robot, bound, feature)
@@ -134,7 +134,7 @@ class ModelSimulator(DescribedSimulator):
             about["p_fail"] = np.nan_to_num(self.p_fail, nan=-1.0).tolist()
         return about
 
-    def _end(self, cells: list[Cell], seed: int) -> tuple[int, str]:
+    def _end(self, cells: Sequence[Station], seed: int) -> tuple[int, str]:
         """Return the number of bounds that the team starts, and the status of the mission."""
         n = len(cells) - 1
         if self.p_fail is None:

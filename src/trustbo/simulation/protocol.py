@@ -7,9 +7,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell, Mission
+from trustbo import data
+from trustbo.data import Mission, Station
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_cells
+from trustbo.errors import TrustboError
 from trustbo.workspace import Workspace
 
 
@@ -21,11 +22,13 @@ class Simulator(Protocol):
     compute a `Truth`, the simulator also needs the attribute `workspace`.
     """
 
-    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
+    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
         """Run a path from its first to its last cell, or until a bound fails.
 
         Args:
-            path: Cells from start to goal.
+            path: Cells from start to goal, (row, col), or (row, col, name) with the set of posts
+                from which T2 watches the move out of the cell; only workspaces with several sets
+                of posts have names.
             seed: Random seed.
             mission: Number of the mission, from 0, for simulators whose world changes.
         """
@@ -45,13 +48,14 @@ class DescribedSimulator(Summary):
         return [(name, text) for name, text in rows if len(text) < 200]
 
 
-def require_path(workspace: Workspace, path: Sequence[Cell]) -> list[Cell]:
+def require_path(workspace: Workspace, path: Sequence[Station]) -> tuple[Station, ...]:
     """Return the cells of a path; raises TrustboError unless it has at least 2, all passable."""
-    path = require_cells("path", path)
-    cells = [workspace.locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
-    if len(cells) < 2:
-        raise TrustboError(f"a path needs at least two cells, start and goal; got {cells}.")
-    return cells
+    stations = data.require_path("path", path)
+    for k, (row, col, *_) in enumerate(stations):
+        workspace.locate((row, col), f"path[{k}]")
+    if len(stations) < 2:
+        raise TrustboError(f"a path needs at least two cells, start and goal; got {stations}.")
+    return stations
 
 
 def digest(*arrays: ArrayLike) -> str:

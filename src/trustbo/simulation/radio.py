@@ -9,14 +9,14 @@ from scipy import ndimage
 from scipy.special import expit
 from scipy.stats import t as student
 
-from trustbo.data import Cell, Mission
+from trustbo.data import Mission, Station
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
 from trustbo.simulation.replicates import table_of
 from trustbo.simulation.world import true_terrain
 from trustbo.terrain import pixel_size
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVES, moves_along
+from trustbo.workspace.moves import MOVES, cells_along, moves_along
 
 FREEDOM = 3.0
 """Degrees of freedom of the noise on contact rates."""
@@ -80,10 +80,11 @@ class RadioSimulator(DescribedSimulator):
         self.seed = own if seed is None else require_whole("seed", seed, 0)
         self.mean = _mean_contact(workspace, terrain, self.seed)
 
-    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
+    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
         """Run a path; the result depends on the seed, but not on the number of the mission."""
         cells = require_path(self.workspace, path)
-        mean = self.mean[:, moves_along(cells), *np.array(cells)[1:].T].T  # (bound, robot)
+        entered = cells_along(cells)[1:].T
+        mean = self.mean[:, moves_along(cells), *entered].T  # (bound, robot)
         rng = np.random.default_rng(require_whole("seed", seed, 0))
         rates = np.clip(mean + SCALE * rng.standard_t(FREEDOM, mean.shape), 0.0, 1.0)
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from trustbo.data import Bound, Cell, Mission
+from trustbo.data import Bound, Mission, Station
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.simulation.kinematic import KinematicSimulator
 from trustbo.simulation.protocol import DescribedSimulator, digest
@@ -116,7 +116,7 @@ class RealtimeAwareness(DescribedSimulator):
         """Return the settings of a mission's world, which are equal for equal worlds."""
         return self.simulator.describe_world(mission)
 
-    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
+    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
         """Run a path and measure awareness; see `KinematicSimulator.run`."""
         return self.measured(self.simulator.run(path, seed=seed, mission=mission), number=mission)
 

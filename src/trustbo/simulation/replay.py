@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable, Sequence
 
-from trustbo.data import Cell, Mission, path_text, require_map
-from trustbo.errors import TrustboError, require_cells, require_whole
+from trustbo.data import Mission, Station, path_text, require_map, require_path
+from trustbo.errors import TrustboError, require_whole
 from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.stacking import list_of_missions
 
@@ -44,7 +44,7 @@ class ReplaySimulator(DescribedSimulator):
         n = len(self.missions)
         return {"simulator": type(self).__name__, "missions": n, "any_path": self.any_path}
 
-    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
+    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
         """Return the recorded mission with the number `mission`; `seed` is not used.
 
         Raises:
@@ -57,7 +57,7 @@ class ReplaySimulator(DescribedSimulator):
             )
 
         recorded = self.missions[mission]
-        asked = require_cells("path", path)
+        asked = require_path("path", path)
         if recorded.path != asked and not self.any_path:
             raise TrustboError(
                 f"mission {mission} was recorded on the path {path_text(recorded.path)}, not on "

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Cell
+from trustbo.data import Cell, Station
 from trustbo.display import Rows, Summary, announced
 from trustbo.errors import TrustboError, require_count, require_whole
 from trustbo.files import FilePath, to_json, to_path, write_file
@@ -23,7 +23,7 @@ from trustbo.simulation.protocol import digest, require_path
 from trustbo.simulation.replicates import replicated
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import END, MOVES, bounds_and_next, by_cell_left
+from trustbo.workspace.moves import END, MOVES, bounds_and_next, by_cell_left, posts_along
 
 
 class Truth(Summary):
@@ -128,7 +128,7 @@ class Truth(Summary):
         """Return the truth for the world of another mission; missions are counted from 0."""
         return self if self._of is None else self._of(mission)
 
-    def lost(self, path: Sequence[Cell]) -> float:
+    def lost(self, path: Sequence[Station]) -> float:
         """Compute the contact lost on a path, in bounds, if no bound fails; NaN without a route.
 
         Raises:
@@ -138,7 +138,7 @@ class Truth(Summary):
         contact, _ = self._along(path)
         return float((1.0 - contact).sum())
 
-    def lost_or_failed(self, path: Sequence[Cell]) -> float:
+    def lost_or_failed(self, path: Sequence[Station]) -> float:
         """Compute the expected contact lost, in bounds; failed and unreached bounds lose 1 each.
 
         The result is sum_k (1 - S_k c_k), where c_k is the contact of bound k and S_k is the
@@ -174,22 +174,27 @@ class Truth(Summary):
             contact, passed, paths.start, paths.goal, paths.longest, u_turns=paths.turns
         )
 
-    def regret(self, path: Sequence[Cell], max_bounds: int | str = "shortest+4") -> float:
+    def regret(self, path: Sequence[Station], max_bounds: int | str = "shortest+4") -> float:
         """Compute the regret of a path, as a percentage of the contact kept on the best path.
 
         The regret is the additional contact lost compared with the best path of at most
         `max_bounds` bounds between the same cells. It is negative if a longer path is better.
         """
         path = require_path(self.workspace, path)
-        best = self.best(path[0], path[-1], max_bounds)
+        best = self.best(path[0][:2], path[-1][:2], max_bounds)
 
         least = self.lost(best)
         kept = len(best) - 1 - least
         return 100.0 * (self.lost(path) - least) / kept if kept > 0.0 else np.nan
 
-    def _along(self, path: Sequence[Cell]) -> tuple[np.ndarray, np.ndarray]:
+    def _along(self, path: Sequence[Station]) -> tuple[np.ndarray, np.ndarray]:
         """Return the contact and the completion probability of a path's bounds, each (bound,)."""
         cells = require_path(self.workspace, path)
+        if posts_along(cells).any():
+            raise TrustboError(
+                "a truth knows the contact from the standard posts only, but the path has other "
+                "posts; measure the contact of missions instead."
+            )
         where = tuple(bounds_and_next(cells).T)
         return self.bounds["contact"].values[where], self.bounds["passed"].values[where]
 

@@ -12,20 +12,23 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled, without_rounding
-from trustbo.data import is_line_of_sight
+from trustbo.data import POST_SETS, is_line_of_sight
 from trustbo.errors import TrustboError, require_kind, require_order
 from trustbo.team import Team
 from trustbo.terrain import FEATURES, CompositeIndex
 from trustbo.terrain.features import pixel_feature
 from trustbo.workspace.grid import MAX_MISSING, Grid
 from trustbo.workspace.line_of_sight import bound_maps
-from trustbo.workspace.moves import MOVE_NAMES, MOVES, existing_bounds
+from trustbo.workspace.moves import MOVES, existing_bounds, way_names
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface
 
 _DIMS = ("robot", "move", "row", "col", "feature")
-_AXES = "(robot, row, col, feature) or (robot, move, row, col, feature) with 8 moves"
+_AXES = (
+    "(robot, row, col, feature) or (robot, move, row, col, feature) with 8 moves, or 8 for each of "
+    f"up to {len(POST_SETS)} sets of posts"
+)
 _RESERVED = ("passable", "x", "y", "spatial_ref")
 """Names of other variables in the dataset of pixels."""
 _STORABLE = re.compile(r"\w([^/\x00-\x1f\x7f]*[^/\x00-\x1f\x7f\s])?")
@@ -150,16 +153,18 @@ def of_moves(cells: np.ndarray, passable: np.ndarray) -> np.ndarray:
 
 
 def with_line_of_sight(
-    z: np.ndarray, pixels: xr.Dataset, passable: np.ndarray, posts: Posts
+    z: np.ndarray, pixels: xr.Dataset, passable: np.ndarray, posts: Posts, n_posts: int
 ) -> np.ndarray:
     """Append line of sight to the awareness of bounds (robot, move, row, col, feature).
 
-    If traversability is one of the features of `pixels`, its values are replaced with means along
+    The result has the ways with the first `n_posts` sets of posts instead of the moves. If
+    traversability is one of the features of `pixels`, its values are replaced with means along
     the robots' tracks.
     """
     is_known = TRAVERSABLE in pixels
     of_pixels = pixels[TRAVERSABLE].values if is_known else posts.surface.passable
-    seen, traversability = bound_maps(posts, passable, of_pixels)
+    seen, traversability = bound_maps(posts, passable, of_pixels, n_posts)
+    z = np.tile(z, (1, n_posts, 1, 1, 1))
     if is_known:
         of_cells = z[..., list(pixels).index(TRAVERSABLE)]
         of_cells[...] = np.where(np.isfinite(traversability), traversability, of_cells)
@@ -169,7 +174,7 @@ def with_line_of_sight(
 def labelled(
     z: np.ndarray, passable: np.ndarray, grid: Grid, team: Team, features: Sequence[str]
 ) -> tuple[xr.DataArray, xr.DataArray]:
-    """Label awareness (robot, move, row, col, feature) and passability (row, col) of a grid.
+    """Label awareness (robot, way, row, col, feature) and passability (row, col) of a grid.
 
     Raises TrustboError if no cell is passable.
     """
@@ -185,7 +190,8 @@ def labelled(
         "x": ("col", grid.x),
     }
 
-    names = {"robot": list(team.names), "move": list(MOVE_NAMES), "feature": list(features)}
+    ways = way_names(z.shape[1] // len(MOVES))
+    names = {"robot": list(team.names), "move": ways, "feature": list(features)}
     return (
         xr.DataArray(z, names | cells, _DIMS, "awareness"),
         xr.DataArray(passable, cells, ("row", "col"), "passable"),
@@ -199,9 +205,10 @@ def unlabelled(
 
     Names that are not given are taken from the labels; see `read_labelled`.
     """
-    of_bounds = isinstance(awareness, xr.DataArray) and "move" in awareness.dims
-    dims = [dim for dim in _DIMS if dim != "move" or of_bounds]
-    coords = {"robot": names, "feature": features, "move": MOVE_NAMES}
+    sizes = awareness.sizes if isinstance(awareness, xr.DataArray) else {}
+    dims = [dim for dim in _DIMS if dim != "move" or dim in sizes]
+    ways = way_names(sizes.get("move", len(MOVES)) // len(MOVES))
+    coords = {"robot": names, "feature": features, "move": ways}
 
     read = read_labelled("awareness", awareness, dims, coords)
     chosen = {dim: read.coords.get(dim, tuple(given)) for dim, given in coords.items()}
@@ -226,7 +233,8 @@ def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np
     Raises TrustboError if the axes do not match, a value is outside [0, 1], or the awareness of a
     passable cell or of a bound between passable cells is NaN.
     """
-    if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] != len(MOVES)):
+    n_ways = {len(MOVES) * n for n in range(1, 1 + len(POST_SETS))}
+    if z.ndim not in (4, 5) or (z.ndim == 5 and z.shape[1] not in n_ways):
         raise TrustboError(f"awareness must have the shape {_AXES}; got shape {z.shape}.")
 
     if not z.size:
@@ -257,10 +265,10 @@ def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np
     if z.ndim == 4:
         return of_moves(z, free), free
 
-    exists = existing_bounds(free)
+    exists = np.tile(existing_bounds(free), (z.shape[1] // len(MOVES), 1, 1))
     if (missing := exists & ~finite).any():
         m, row, col = (int(i) for i in np.argwhere(missing)[0])
-        down, right = MOVES[m]
+        down, right = MOVES[m % len(MOVES)]
         raise TrustboError(
             f"awareness of the bound {(row - down, col - right)} -> {(row, col)} is NaN; give a "
             "value or mark one of the cells impassable."

@@ -12,6 +12,9 @@ where p is the detection probability under the assumed model of sight, T_1 is th
 time and T_2 is the driving time of the slowest robot. A robot that arrives earlier waits at its
 post. The assumed next cell changes with k, so that all cells ahead are represented.
 
+Each set of posts in a has its own line of sight. T2 is assumed to close up to the standard posts in
+c, so that line of sight does not depend on the set that is chosen there.
+
 The lead takes the fastest route, as in the simulator. T2 is assumed to follow that route, shifted
 to T2's posts. Finding T2's own fastest routes would take about 50 searches for each bound. These
 routes differ from the assumed routes by a few metres, over which sight hardly changes.
@@ -24,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trustbo.data import Cell
+from trustbo.data import POST_SETS, Cell, Station
 from trustbo.parallel import in_order
 from trustbo.team import Robot, Team
 from trustbo.workspace.moves import MOVES, existing_bounds
@@ -49,21 +52,21 @@ class Geometry(NamedTuple):
 
 
 def bound_maps(
-    posts: Posts, passable: np.ndarray, traversability: np.ndarray
+    posts: Posts, passable: np.ndarray, traversability: np.ndarray, n_posts: int = 1
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the line of sight and the traversability of all bounds between passable cells.
 
     The traversability of a bound is the mean of a pixel map, shape (row, col), along T2's tracks.
 
     Returns:
-        Two arrays of shape (robot, move, row, col), in [0, 1]; NaN where there is no bound or no
-        data along the tracks.
+        Two arrays of shape (robot, way, row, col), in [0, 1], for the first `n_posts` sets of
+        posts; NaN where there is no bound or no data along the tracks.
     """
-    exists = existing_bounds(passable)
+    exists = np.tile(existing_bounds(passable), (n_posts, 1, 1))
     maps = np.full((2, len(posts.team.robots), *exists.shape), np.nan)
 
     def of_block(block: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-        index = np.array(block)  # (bound, (move, row, col))
+        index = np.array(block)  # (bound, (way, row, col))
         given = geometry(posts, index, passable)
         return index.T, bound_features(
             posts.surface, posts.sight, posts.team, given, traversability
@@ -76,15 +79,17 @@ def bound_maps(
 
 
 def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
-    """Collect the geometry of bounds; `index` (bound, 3) contains their (move, row, col)."""
-    left = (index[:, 1:] - np.array(MOVES)[index[:, 0]]).tolist()
-    bounds = [
-        ((i, j), (row, col)) for (i, j), (_, row, col) in zip(left, index.tolist(), strict=True)
+    """Collect the geometry of bounds; `index` (bound, 3) contains their (way, row, col)."""
+    numbers, moves = np.divmod(index[:, 0], len(MOVES))
+    left = (index[:, 1:] - np.array(MOVES)[moves]).tolist()
+    bounds: list[tuple[Station, Cell]] = [
+        ((i, j, POST_SETS[number]), (row, col))
+        for (i, j), (_, row, col), number in zip(left, index.tolist(), numbers, strict=True)
     ]
 
     ends = []
     for a, c in bounds:
-        ahead = [posts.watching(c, b) for b in _cells_ahead(passable, a, c)]
+        ahead = [posts.watching(c, b) for b in _cells_ahead(passable, a[:2], c)]
         ends.append([ahead[k % len(ahead)] for k in range(N_SAMPLES)])
 
     return Geometry(

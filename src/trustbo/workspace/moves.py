@@ -1,11 +1,15 @@
-"""Moves between neighbouring cells. A bound is identified by its move and the cell it enters."""
+"""Moves between neighbouring cells. A bound is identified by its way and the cell it enters.
+
+A way is a move together with the set of posts from which T2 watches the lead: the number of a way
+is move + 8 set, where set 0 is the standard one. With a single set, ways are moves.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_list, require_pair
+from trustbo.data import POST_SETS, Cell, Station, require_path
+from trustbo.errors import TrustboError
 
 MOVES = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 """Steps (down, right) to the neighbouring cells; the reverse of move m is move 7 - m."""
@@ -17,16 +21,17 @@ NEXT_NAMES = (*MOVE_NAMES, "end")
 """Names of the moves that can follow a bound, and `"end"`."""
 
 
-def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -> list[Cell]:
-    """Return the cells of a path as pairs of ints.
+def require_on_grid(
+    path: Sequence[Station] | np.ndarray, shape: tuple[int, ...]
+) -> tuple[Station, ...]:
+    """Return the cells of a path.
 
-    Raises TrustboError if a cell is not a pair or is outside a grid with the shape (row, col).
+    Raises TrustboError if a cell is invalid or is outside a grid with the shape (row, col).
     """
-    listed = require_list("path", path, remedy="give cells (row, col)")
-    cells = [require_pair("a cell", cell) for cell in listed]
+    cells = require_path("path", path)
 
     rows, cols = shape
-    for row, col in cells:
+    for row, col, *_ in cells:
         if not (0 <= row < rows and 0 <= col < cols):
             raise TrustboError(
                 f"cell {(row, col)} is outside the grid of {rows} rows and {cols} columns; rows "
@@ -35,12 +40,29 @@ def require_on_grid(path: Sequence[Cell] | np.ndarray, shape: tuple[int, ...]) -
     return cells
 
 
-def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
+def way_names(n_posts: int) -> list[str]:
+    """Return the names of the ways with the first `n_posts` sets of posts: "ne", ..., "ne far"."""
+    others = [f"{move} {name}" for name in POST_SETS[1:n_posts] for move in MOVE_NAMES]
+    return [*MOVE_NAMES, *others]
+
+
+def cells_along(path: Sequence[Station] | np.ndarray) -> np.ndarray:
+    """Return the rows and columns of the cells of a path, shape (cell, 2)."""
+    return np.array([cell[:2] for cell in path])
+
+
+def posts_along(path: Sequence[Station] | np.ndarray) -> np.ndarray:
+    """Return the number of the set of posts of each bound of a path, shape (bound,)."""
+    names = [cell[2] if len(cell) > 2 else POST_SETS[0] for cell in path[:-1]]
+    return np.array([POST_SETS.index(name) for name in names], int)
+
+
+def moves_along(path: Sequence[Station] | np.ndarray) -> np.ndarray:
     """Return the index in `MOVES` of each bound of a path, shape (bound,).
 
     Raises TrustboError if two successive cells are not neighbours.
     """
-    cells = np.asarray(path)
+    cells = cells_along(path)
     steps = np.diff(cells, axis=0)
 
     if (far := np.abs(steps).max(1) != 1).any():
@@ -52,17 +74,18 @@ def moves_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
     return index - (index > 4)
 
 
-def bounds_along(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
-    """Return the move, row and column of each bound of a path, (bound, 3); see `moves_along`."""
-    return np.column_stack([moves_along(path), np.asarray(path)[1:]])
+def bounds_along(path: Sequence[Station] | np.ndarray) -> np.ndarray:
+    """Return the way, row and column of each bound of a path, (bound, 3); see `moves_along`."""
+    ways = moves_along(path) + len(MOVES) * posts_along(path)
+    return np.column_stack([ways, cells_along(path)[1:]])
 
 
-def bounds_and_next(path: Sequence[Cell] | np.ndarray) -> np.ndarray:
+def bounds_and_next(path: Sequence[Station] | np.ndarray) -> np.ndarray:
     """Return the move, row, column and next move of each bound of a path, shape (bound, 4).
 
     The next move of the last bound is `END`. Raises TrustboError as `moves_along` does.
     """
-    bounds = bounds_along(path)
+    bounds = np.column_stack([moves_along(path), cells_along(path)[1:]])
     return np.column_stack([bounds, np.append(bounds[1:, 0], END)])
 
 
@@ -100,13 +123,13 @@ def existing_bounds(passable: np.ndarray) -> np.ndarray:
     return np.stack(left) & passable
 
 
-def along(maps: np.ndarray, path: Sequence[Cell] | np.ndarray) -> np.ndarray:
+def along(maps: np.ndarray, path: Sequence[Station] | np.ndarray) -> np.ndarray:
     """Select the values of maps for the bounds of a path, shape (..., bound, feature).
 
-    The maps have the shape (..., move, row, col, feature).
+    The maps have the shape (..., way, row, col, feature).
     """
-    moves, rows, cols = bounds_along(path).T
-    return maps[..., moves, rows, cols, :]
+    ways, rows, cols = bounds_along(path).T
+    return maps[..., ways, rows, cols, :]
 
 
 def cells_ahead(bounds: np.ndarray) -> dict[Cell, list[Cell]]:

@@ -12,17 +12,21 @@ the stop, possibly outside the cell, and away from the lead's route. The slope i
 limit at each post and along at least one way from the post to the stop. The lead stops where the
 routes to the neighbouring stops are most visible.
 
+No choice of posts is best everywhere. The sets of posts in `SETS` differ in their weights and
+distances, and a planner can choose among them in each bound.
+
 Real obstacles may be missing from maps, and mapped obstacles may not block sight. The choice of
 posts and stops allows for such errors (`Posts._seen`); the feature `line_of_sight` does not.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.distance import cdist
 
-from trustbo.data import Cell
+from trustbo.data import POST_SETS, Cell, Station
 from trustbo.errors import TrustboError, warn
 from trustbo.team import Robot, Team
 from trustbo.workspace.grid import Grid
@@ -37,7 +41,6 @@ SPACING = 2.0
 """Minimum distance between T2's robots, m."""
 RADIUS = 25.0
 """Maximum distance of T2 from the lead's stop, m."""
-_GAP = 4.0  # preferred minimum distance between two posts, m
 _STEP = 4.0  # spacing of the lattice of positions, m
 _STOP_RADIUS = 16.0  # search radius for the lead's stop, m
 _SMOOTHED = 5.0  # width of the moving average of traversability for stops, m
@@ -48,12 +51,43 @@ _DOUBT_REACH = 40.0  # decay length of this probability, m
 _NEARER = 1e-3  # penalty on the score per metre from the stop
 _IN_THE_WAY = 5.0  # penalty of a post on the lead's route, larger than any probability
 _TOO_CLOSE = 10.0  # penalty of a post beside another one
-_WATCHING = 0.5  # weight of the sight of the lead's route in the score of a post
-_CLOSING = 0.25  # weight of the sight from each of the lead's two stops
 _N_WATCHED = 30  # number of positions, best seen from the stops, that are rated for all aims
 _N_AIMS = 6  # number of times on the lead's route at which sight is computed
 _LISTED = 5  # number of cells without room that a warning names
 _SHARES = np.array([0.25, 0.5, 0.75, 1.0])  # fractions of the straight line to a neighbouring stop
+
+
+class PostSet(NamedTuple):
+    """What makes good posts, in one of the sets from which a planner can choose.
+
+    Attributes:
+        radius: Maximum distance of T2 from the lead's stop, m.
+        gap: Preferred minimum distance between two posts, m.
+        nearer: Penalty on the score per metre from the stop.
+        watching: Weight of the sight of the lead's route in the score; the sight from each of the
+            lead's two stops has half of the remaining weight.
+    """
+
+    radius: float = RADIUS
+    gap: float = 4.0
+    nearer: float = _NEARER
+    watching: float = 0.5
+
+
+_STANDARD = PostSet()
+SETS = dict(
+    zip(
+        POST_SETS,
+        (
+            _STANDARD,
+            PostSet(radius=60.0, gap=20.0, nearer=0.0),
+            PostSet(radius=35.0, gap=8.0, watching=0.9),
+            PostSet(radius=40.0, gap=12.0, nearer=0.0),
+        ),
+        strict=True,
+    )
+)
+"""Sets of posts, keyed by name; the order is that in which a workspace offers them."""
 
 
 class Posts:
@@ -90,12 +124,13 @@ class Posts:
 
         self._central = self._central_stops(traversability)
         self._stops: dict[Cell, np.ndarray] = {}
-        self._posts: dict[tuple[Cell, Cell | None], np.ndarray] = {}
+        self._posts: dict[tuple[Cell, Cell | None, str], np.ndarray] = {}
 
     # --- routes ---
 
-    def window(self, *cells: Cell) -> Window:
+    def window(self, *stations: Station) -> Window:
         """Return the pixel window that contains cells and a margin of half a cell around them."""
+        cells = [station[:2] for station in stations]
         rows, cols = self.surface.ground.shape
         shape = np.array(self.grid.shape)
 
@@ -138,7 +173,7 @@ class Posts:
         return then and not now
 
     def bound_routes(
-        self, a: Cell, c: Cell, next_cell: Cell | None
+        self, a: Station, c: Station, next_cell: Station | None
     ) -> tuple[np.ndarray | None, ...]:
         """Find the robots' routes in the bound a -> c, the lead's route first, each (point, 2).
 
@@ -150,19 +185,20 @@ class Posts:
         window = self.window(a, c)
         return self._lead_route(a, c), *(self.routes.find(*each, window) for each in ends)
 
-    def _lead_route(self, a: Cell, c: Cell) -> np.ndarray | None:
+    def _lead_route(self, a: Station, c: Station) -> np.ndarray | None:
         """Find the lead's route from its stop in a to its stop in c, (point, 2), or None."""
         return self.routes.find(self.team.lead, self.stop(a), self.stop(c), self.window(a, c))
 
-    def lead_line(self, a: Cell, c: Cell) -> np.ndarray:
+    def lead_line(self, a: Station, c: Station) -> np.ndarray:
         """Return the lead's route in a bound, (point, 2), or a straight line if there is none."""
         route = self._lead_route(a, c)
         return np.stack([self.stop(a), self.stop(c)]) if route is None else route
 
     # --- stops of the lead ---
 
-    def stop(self, cell: Cell) -> np.ndarray:
+    def stop(self, station: Station) -> np.ndarray:
         """Return the lead's stop, (2,), from which routes to other stops are most visible."""
+        cell = station[:2]
         if cell not in self._stops:
             self._stops[cell] = self._choose_stop(cell)
         return self._stops[cell]
@@ -207,30 +243,36 @@ class Posts:
 
     # --- posts of T2 ---
 
-    def watching(self, cell: Cell, next_cell: Cell | None) -> np.ndarray:
+    def watching(self, station: Station, after: Station | None) -> np.ndarray:
         """Return the posts in a cell from which T2 watches the lead's next move, shape (robot, 2).
 
-        If `next_cell` is None, the cell is the goal, and T2 stands around the lead.
+        The station is a cell, (row, col), or a cell with a set of posts, (row, col, name). If
+        `after` is None, the cell is the goal, and T2 stands around the lead.
         """
-        if (cell, next_cell) not in self._posts:  # all next cells take little longer
+        cell = station[:2]
+        next_cell = after and after[:2]
+        name = station[2] if len(station) > 2 and after else POST_SETS[0]
+        key = cell, next_cell, name
+
+        if key not in self._posts:  # all next cells take little longer
             around = [c for c in self._around(cell) if self._is_in_region(self.stop(c))]
             ahead = list(dict.fromkeys([None, *around, next_cell]))
-            for c, posts in zip(ahead, self._choose_posts(cell, ahead), strict=True):
-                self._posts[cell, c] = posts
-        return self._posts[cell, next_cell]
+            for c, posts in zip(ahead, self._choose_posts(cell, ahead, SETS[name]), strict=True):
+                self._posts[cell, c, name] = posts
+        return self._posts[key]
 
-    def _choose_posts(self, cell: Cell, ahead: Sequence[Cell | None]) -> np.ndarray:
+    def _choose_posts(self, cell: Cell, ahead: Sequence[Cell | None], aim: PostSet) -> np.ndarray:
         """Choose the posts for each next cell, one robot at a time, (next cell, robot, 2)."""
         here = self.stop(cell)
         robots = self.team.robots
 
-        position = self._lattice(cell, here, RADIUS)
-        gap = _GAP
+        position = self._lattice(cell, here, aim.radius)
+        gap = aim.gap
         if len(position) < len(robots):  # too little safe ground
             position = self._pixels_near(cell, here)
             gap = SPACING
 
-        scores = self._scores(cell, ahead, position)
+        scores = self._scores(cell, ahead, position, aim)
 
         posts = np.empty((len(ahead), len(robots), 2))
         for i, robot in enumerate(robots):
@@ -245,7 +287,7 @@ class Posts:
         return posts
 
     def _scores(
-        self, cell: Cell, ahead: Sequence[Cell | None], position: np.ndarray
+        self, cell: Cell, ahead: Sequence[Cell | None], position: np.ndarray, aim: PostSet
     ) -> dict[Robot, np.ndarray]:
         """Score positions as posts of each robot, (next cell, position); see the formula above."""
         here = self.stop(cell)
@@ -255,17 +297,18 @@ class Posts:
         first = np.cumsum([0, *map(len, routes)])
         aims, _ = at_times(self.surface, lead, np.concatenate(routes), first, _N_AIMS)
 
-        nearer = _NEARER * np.linalg.norm(position - here, axis=1)
+        nearer = aim.nearer * np.linalg.norm(position - here, axis=1)
         blocking = np.array([cdist(position, route).min(1) < SPACING for route in routes])
 
         scores = {}
         for robot in dict.fromkeys(self.team.robots):
-            closing = _CLOSING * self._seen(stops[:, None], position, lead, robot)
+            closing = self._seen(stops[:, None], position, lead, robot)
+            closing *= (1.0 - aim.watching) / 2.0
             seen = closing[0] + closing[1:]
 
             best = np.argsort(nearer - seen, axis=1, kind="stable")[:, :_N_WATCHED]
             eyes = position[best][:, :, None] + jittered(_N_AIMS)
-            watched = _WATCHING * self._seen(eyes, aims[:, None], robot, lead).mean(-1)
+            watched = aim.watching * self._seen(eyes, aims[:, None], robot, lead).mean(-1)
 
             score = seen - 1.0  # for positions whose sight of the route is not computed
             np.put_along_axis(score, best, np.take_along_axis(seen, best, 1) + watched, 1)

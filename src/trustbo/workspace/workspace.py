@@ -1,10 +1,10 @@
 """Workspace with the awareness of every bound and the passability of every cell."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import xarray as xr
@@ -14,14 +14,23 @@ from trustbo.arrays import as_names
 from trustbo.data import (
     FEATURES,
     LINE_OF_SIGHT,
+    POST_SETS,
     Cell,
     Mission,
+    Station,
     default_features,
     is_line_of_sight,
     require_map,
 )
 from trustbo.display import Rows, Summary, announced
-from trustbo.errors import TrustboError, require_kind, require_list, require_positive
+from trustbo.errors import (
+    TrustboError,
+    require_choice,
+    require_kind,
+    require_list,
+    require_positive,
+    require_whole,
+)
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.features import PAPER_VISIBILITY, TRAVERSABILITY, VISIBILITY
@@ -38,7 +47,7 @@ from trustbo.workspace.awareness import (
 )
 from trustbo.workspace.difficulty import Difficulty
 from trustbo.workspace.grid import MAX_MISSING, Grid, Location
-from trustbo.workspace.moves import MOVE_NAMES, along, existing_bounds
+from trustbo.workspace.moves import MOVE_NAMES, MOVES, along, existing_bounds
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface, surface_of
@@ -53,7 +62,8 @@ class Workspace(Summary):
 
     Attributes:
         awareness: DataArray (robot, move, row, col, feature), in [0, 1]. A value applies to the
-            bound that enters the cell (row, col) by the move; NaN if there is no such bound.
+            bound that enters the cell (row, col) by the move; NaN if there is no such bound. With
+            several sets of posts, the moves are named "ne" with the standard set, "ne far", ...
         passable: Boolean DataArray (row, col).
         grid: Shape, position and cell size of the planning grid.
         team: Lead and overwatching robots.
@@ -87,6 +97,7 @@ class Workspace(Summary):
         features: Mapping[str, object] | None = None,
         bounds: bool = True,
         sight: Sight | None = None,
+        n_posts: int = 1,
     ) -> Self:
         """Make a workspace with features computed from a DEM and a DSM.
 
@@ -111,6 +122,12 @@ class Workspace(Summary):
             bounds: If False, define awareness for cells only, as in the paper, without line of
                 sight and with the visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight; by default `Sight()`.
+            n_posts: Number of sets of posts, 1 to 4, from which T2 can watch the lead in each
+                bound. With more than one, planners choose a set in each cell of a path together
+                with the cells. The sets are, in this order: "standard"; "far", up to 60 m from the
+                lead's stop and 20 m apart; "route", mostly for the sight of the lead's route; and
+                "wide", up to 40 m from the stop and 12 m apart. Line of sight and traversability
+                differ between sets; the difficulty of driving is that of the standard one.
 
         Raises:
             TrustboError: The dataset is not a terrain, the grid is too fine for the raster, all
@@ -124,6 +141,12 @@ class Workspace(Summary):
         team = Team.of(team)
         sight = Sight.of(sight)
         grid = Grid.over(terrain, shape)
+        n_posts = require_whole("n_posts", n_posts, 1, len(POST_SETS))
+        if n_posts > 1 and not bounds:
+            raise TrustboError(
+                "n_posts > 1 needs line of sight, which is defined for bounds; leave out "
+                "bounds=False, or n_posts."
+            )
 
         if features is None:
             visibility = VISIBILITY if bounds else PAPER_VISIBILITY
@@ -148,7 +171,7 @@ class Workspace(Summary):
             z = np.repeat(of_moves(cells, passable)[None], team.n_robots, axis=0)
             names = [*features]
             if bounds:
-                z = with_line_of_sight(z, pixels, passable, posts)
+                z = with_line_of_sight(z, pixels, passable, posts, n_posts)
                 names.append(LINE_OF_SIGHT)
 
         maps = labelled(z, passable, grid, team, names)
@@ -170,7 +193,8 @@ class Workspace(Summary):
         Args:
             awareness: Awareness of each cell, shape (robot, row, col, feature), which applies to
                 all moves into the cell; or awareness of each bound, shape (robot, move, row, col,
-                feature), for the eight `MOVES` into the cell. Values are in [0, 1].
+                feature), for the eight `MOVES` into the cell. Values are in [0, 1]. With n sets of
+                posts, there are 8 n moves: those with the standard set, then those with the next.
             passable: Whether each cell is passable, shape (row, col). By default, a cell is
                 passable if its awareness, or that of at least one bound into it, has no NaN.
             cell_size: Side length of a cell, in metres.
@@ -207,6 +231,16 @@ class Workspace(Summary):
         """Names of the awareness features."""
         return tuple(str(name) for name in self.awareness["feature"].values)
 
+    @property
+    def n_posts(self) -> int:
+        """Number of sets of posts for each bound."""
+        return self.awareness.sizes["move"] // len(MOVES)
+
+    @property
+    def post_sets(self) -> tuple[str, ...]:
+        """Names of the sets of posts, the standard one first."""
+        return POST_SETS[: self.n_posts]
+
     def _rows(self) -> Rows:
         grid = self.grid
         free = self.passable.values
@@ -220,6 +254,7 @@ class Workspace(Summary):
             ("cell", f"{grid.cell_height:.4g} m x {grid.cell_width:.4g} m"),
             ("CRS", grid.crs_name),
             ("team", f"a lead and {', '.join(team.names)}"),
+            *([("posts", ", ".join(self.post_sets))] if self.n_posts > 1 else []),
             ("awareness", "of the middle 80 % of bounds"),
             *spread,
             ("sight", "none assumed" if self.sight is None else str(self.sight)),
@@ -267,11 +302,12 @@ class Workspace(Summary):
             traversability = self.pixels[TRAVERSABLE].values
         return Difficulty(self.passable_bounds.values, self.posts, traversability)
 
-    def along(self, path: Sequence[Cell], *, anywhere: bool = False) -> np.ndarray:
+    def along(self, path: Sequence[Station], *, anywhere: bool = False) -> np.ndarray:
         """Return the awareness of a path's bounds, shape (bound, robot, feature), in [0, 1].
 
         Args:
-            path: Cells, each a neighbour of the previous one.
+            path: Cells, each a neighbour of the previous one; (row, col, name) for a set of posts
+                other than the standard one.
             anywhere: Whether impassable cells are allowed; their awareness may be NaN.
 
         Raises:
@@ -283,8 +319,16 @@ class Workspace(Summary):
         if not path:
             raise TrustboError("path must contain at least one cell; got none.")
 
-        cells = [locate(cell, f"path[{k}]") for k, cell in enumerate(path)]
+        cells = [self._station(station, f"path[{k}]", locate) for k, station in enumerate(path)]
         return np.swapaxes(along(self.awareness.values, cells), 0, 1)
+
+    def _station(self, station: Any, what: str, locate: Callable[[Any, str], Cell]) -> Station:
+        """Find the cell of a station; raises TrustboError if its set of posts is not offered."""
+        if not (isinstance(station, tuple | list) and len(station) == 3):
+            return locate(station, what)
+
+        name = require_choice(f"posts of {what}", station[2], self.post_sets)
+        return *locate(tuple(station[:2]), what), name
 
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the workspace's order.

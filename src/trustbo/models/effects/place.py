@@ -18,12 +18,14 @@ from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
 from trustbo.models.sight_scale import scale_at, variation
-from trustbo.models.visited import bounds_of, maps_of, visited
+from trustbo.models.visited import Visited, bounds_of, maps_of, visited
 from trustbo.statespace.matrices import namespace
-from trustbo.workspace import Workspace
+from trustbo.workspace import MOVES, Workspace
 
 _JITTER = 1e-8  # added to the correlation matrix of cells
 _LENGTH_SCALES = (1e-6, 1e6)  # limits in cells, where cells are independent or equal
+BETWEEN_POSTS = 0.5
+"""Correlation of the effects e of a bound between different sets of posts."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,9 @@ class PlaceEffect(Effect):
     The map is simply wrong about a few bounds. If f_e is not fixed, 5 % of the draws of e in a
     bound that was never driven are therefore half-normal with scale 3 tau_e, and move trust towards
     0.5. The draws are shifted so that their mean remains 0. Fits and planned paths do not change.
+
+    A bound has an effect e, and effects r, for each set of posts from which T2 watches it. The
+    effects e of different sets have the correlation `BETWEEN_POSTS`; effects r are independent.
 
     The errors of awareness differ between robots, and they are the same each time that the robots
     drive a bound. Without r_i, these errors would look like independent noise, and bounds that the
@@ -153,7 +158,8 @@ class PlaceEffect(Effect):
         places: Any = observations.visited
         g = scale_of_bounds(theta, _variation(observations))  # (point or 1, bound)
         ones = np.ones((len(theta["tau_e"]), len(places.bounds)))
-        of_bounds = ones * xp.maximum(g * theta["tau_e"][:, None], LEAST) ** -2.0
+        sd = ones * xp.maximum(g * theta["tau_e"][:, None], LEAST)
+        of_bounds = _precision_of_bounds(sd, _same_bound(places))
         of_robot = ones * xp.maximum(g * theta["tau_r"][:, None], LEAST) ** -2.0
         of_robots = xp.repeat(of_robot, observations.n_robots - 1, axis=1)
 
@@ -203,6 +209,29 @@ def scale_of_bounds(theta: Mapping[str, Any], of_bound: np.ndarray) -> Any:
     if "f_e" not in theta:
         return np.ones((1, len(of_bound)))
     return scale_at(of_bound, theta["f_e"][:, None])
+
+
+def _same_bound(places: Visited) -> np.ndarray:
+    """Return whether visited ways are those of the same bound, shape (bound, bound)."""
+    bounds = np.column_stack([places.bound_map, places.bounds])
+    bounds[:, 1] %= len(MOVES)
+    return (bounds[:, None] == bounds).all(-1)
+
+
+def _precision_of_bounds(sd: Any, same: np.ndarray) -> Any:
+    """Compute the precision of e, (point, bound, bound), or (point, bound) if it is diagonal.
+
+    In the standard deviations sd (point, bound), the n ways of a bound have unit variances and the
+    correlation c = `BETWEEN_POSTS`. The inverse of this matrix is
+    (I - c / (1 + (n - 1) c) 1 1^T) / (1 - c).
+    """
+    n_ways = same.sum(1)
+    if (n_ways == 1).all():
+        return sd**-2.0
+
+    common = BETWEEN_POSTS / (1.0 + (n_ways - 1.0) * BETWEEN_POSTS)
+    inverse = (np.eye(len(same)) - common * same) / (1.0 - BETWEEN_POSTS)
+    return inverse / (sd[:, :, None] * sd[:, None, :])
 
 
 def _variation(observations: Observations) -> np.ndarray:

@@ -1,0 +1,172 @@
+"""Sets of posts: where T2 stands, what it sees, and how paths, files and plans carry the set."""
+
+import json
+
+import numpy as np
+import pytest
+from worlds import hillside
+
+import trustbo as tb
+from trustbo.data import POST_SETS
+from trustbo.simulation import KinematicSimulator, Truth
+from trustbo.workspace.moves import bounds_along, bounds_and_next, way_names
+from trustbo.workspace.posts import SETS
+
+ENDS = (2, 0), (0, 2)
+ROUTE = ((2, 0, "far"), (1, 1), (1, 2, "route"), (0, 2))
+"""A path with two sets of posts beside the standard one."""
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    return tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=4)
+
+
+@pytest.fixture(scope="module")
+def result(workspace):
+    simulator = KinematicSimulator(workspace)
+    return tb.iterate(workspace, *ENDS, simulator=simulator, n_iterations=3, seed=1)
+
+
+def test_the_standard_set_is_that_of_a_workspace_with_one_set(workspace):
+    one = tb.Workspace.from_terrain(hillside(), (3, 3))
+    assert (one.n_posts, one.post_sets) == (1, ("standard",))
+    assert workspace.post_sets == POST_SETS == tuple(SETS)
+    assert workspace.awareness["move"].values.tolist() == way_names(4)
+    np.testing.assert_array_equal(workspace.awareness.values[:, :8], one.awareness.values)
+    np.testing.assert_array_equal(
+        workspace.awareness.sel(move="ne").values, one.awareness.sel(move="ne").values
+    )
+
+    visibility = workspace.awareness.sel(feature="visibility").values
+    np.testing.assert_array_equal(visibility[:, 8:16], visibility[:, :8])  # that of the cell
+    sight = workspace.awareness.sel(feature="line_of_sight").values
+    assert np.nanmax(np.abs(sight[:, 8:16] - sight[:, :8])) > 0.01
+
+
+@pytest.mark.parametrize("name", POST_SETS)
+def test_posts_keep_the_distances_of_their_set(workspace, name):
+    posts = workspace.posts
+    stop = posts.stop((1, 1))
+    places = posts.watching((1, 1, name), (0, 1))
+    assert (np.linalg.norm(places - stop, axis=1) <= SETS[name].radius + 1.0).all()
+
+    apart = np.linalg.norm(places[:, None] - places, axis=2) + 1e9 * np.eye(len(places))
+    room = name != "far"  # on a hillside of 90 m, posts 20 m apart may be too few
+    assert apart.min() >= (SETS[name].gap if room else 2.0) - 1e-9
+    np.testing.assert_array_equal(posts.watching((1, 1, name), None), posts.watching((1, 1), None))
+
+
+def test_ways_are_moves_with_a_set_of_posts():
+    np.testing.assert_array_equal(bounds_along(ROUTE), [[2 + 8, 1, 1], [4, 1, 2], [1 + 16, 0, 2]])
+    plain = [cell[:2] for cell in ROUTE]
+    np.testing.assert_array_equal(bounds_and_next(ROUTE), bounds_and_next(plain))
+
+
+def test_a_mission_measures_the_awareness_of_its_posts(workspace):
+    simulator = KinematicSimulator(workspace)
+    mission = simulator.run(ROUTE, seed=3)
+    assert mission.path == ROUTE
+    assert [bound.cell for bound in mission.bounds] == [(1, 1), (1, 2), (0, 2)]
+    of_path = workspace.awareness.values[:, [10, 4, 17], [1, 1, 0], [1, 2, 2]]
+    np.testing.assert_array_equal(mission.awareness, np.swapaxes(of_path, 0, 1))
+
+    first = mission.bounds[0].poses[0, 1:, :2]
+    off = np.linalg.norm(first - workspace.posts.watching((2, 0, "far"), (1, 1)), axis=1)
+    assert off.max() < 3.0
+    plain = simulator.run([cell[:2] for cell in ROUTE], seed=3)
+    assert not np.array_equal(plain.bounds[0].poses[0], mission.bounds[0].poses[0])
+
+
+def test_a_campaign_chooses_sets_and_its_files_keep_them(workspace, result, tmp_path):
+    plan = result.plan
+    chosen = {cell[2:] for mission in result.missions for cell in mission.path}
+    assert len(chosen) > 1
+    assert (result.table()["state"] == "learned").all()
+    np.testing.assert_array_equal(plan.posts[0], workspace.posts.watching(*plan.path[:2]))
+    assert plan.to_frame()["posts"].isin([*POST_SETS, ""]).all()
+    assert result.history["posts"].values.max() > 0
+
+    read = tb.logs.read_table(tb.logs.to_frame(result.missions))
+    assert [mission.path for mission in read] == [mission.path for mission in result.missions]
+    tb.logs.write_missions(tmp_path / "log.nc", result.missions)
+    stored = tb.logs.read_missions(tmp_path / "log.nc")
+    assert all(a.has_same_data(b) for a, b in zip(stored, result.missions, strict=True))
+
+    tb.export.write_geojson(tmp_path / "plan.geojson", plan)
+    features = json.loads((tmp_path / "plan.geojson").read_text())["features"]
+    names = [f["properties"]["posts"] for f in features if "robot" in f["properties"]
+             and "posts" in f["properties"]]  # fmt: skip
+    assert len(names) == 3 * (len(plan.path) - 1)
+    assert set(names) == {(*cell, POST_SETS[0])[2] for cell in plan.path[:-1]}
+
+
+def test_a_stored_campaign_with_sets_resumes_as_if_it_had_not_stopped(workspace, result, tmp_path):
+    simulator = KinematicSimulator(workspace)
+    folder = tmp_path / "campaign"
+    tb.iterate(workspace, *ENDS, simulator=simulator, n_iterations=2, seed=1, directory=folder)
+    again = tb.resume(folder, n_iterations=3, simulator=simulator)
+    assert again.workspace.n_posts == 4
+    paths = [mission.path for mission in result.missions]
+    assert [mission.path for mission in again.missions] == paths
+    assert again.plan.path == result.plan.path
+
+
+def test_a_mission_whose_first_bound_has_other_posts_is_learned(workspace):
+    campaign = tb.Campaign(workspace, *ENDS)
+    campaign.tell(KinematicSimulator(workspace).run(ROUTE, seed=3))
+    assert campaign.table()["state"].tolist() == ["learned"]
+    assert "bound_move" in campaign.posterior["places"].coords
+
+
+def test_trust_is_that_of_the_posts_asked_for(workspace, result):
+    usual = result.trust("r1", (1, 1), move="ne")
+    far = result.trust("r1", (1, 1), move="ne", posts="far")
+    assert float(np.abs(usual.mean() - far.mean())) > 1e-4
+    with pytest.raises(tb.TrustboError, match="unknown posts 'near'; choose one of standard, far"):
+        result.trust("r1", (1, 1), posts="near")
+
+
+def test_a_team_that_follows_a_plan_and_turns_off_has_the_standard_posts(workspace, result):
+    campaign = tb.Campaign(workspace, *ENDS)
+    plan = campaign.ask()
+    follower = tb.Follower(campaign)
+    follower.begin(t=0.0, cell=plan.path[1][:2])
+    assert follower.path == plan.path  # the planned cell, with the planned posts
+    follower.tick(1.0, [True, True, False])
+    follower.end(t=10.0, status="stuck")
+    rest = follower.replan(blocked=[(plan.path[0][:2], plan.path[1][:2])])
+    assert rest.path[0][:2] == plan.path[0][:2]
+
+
+@pytest.mark.parametrize(
+    ("path", "problem"),
+    [
+        ([(2, 0, "near"), (1, 1)], "unknown the posts of path.0. 'near'; choose one of standard"),
+        ([(2, 0, 1), (1, 1)], "two whole numbers"),
+        ([(2, 0, "far", 1), (1, 1)], "two whole numbers"),
+    ],
+)
+def test_unknown_sets_are_refused(workspace, path, problem):
+    with pytest.raises(tb.TrustboError, match=problem):
+        KinematicSimulator(workspace).run(path, seed=0)
+
+
+def test_sets_that_a_workspace_does_not_offer_are_refused():
+    two = tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=2)
+    with pytest.raises(tb.TrustboError, match=r"posts of path\[2\] 'route'; choose one of"):
+        two.along(ROUTE)
+    with pytest.raises(tb.TrustboError, match="n_posts must be at most 4"):
+        tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=5)
+    with pytest.raises(tb.TrustboError, match="n_posts > 1 needs line of sight"):
+        tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=2, bounds=False)
+    with pytest.raises(tb.TrustboError, match="from the standard posts only"):
+        Truth.from_simulator(KinematicSimulator(two)).lost(ROUTE[:2])
+
+
+def test_a_graph_has_an_edge_for_each_set(workspace, result):
+    graph = result.planner.graph(result.posterior)
+    assert graph.is_multigraph()
+    assert set(graph[2, 0][1, 1]) == set(POST_SETS)
+    least = min(edge["lost"] for edge in graph[2, 0][1, 1].values())
+    assert least < graph[2, 0][1, 1]["standard"]["lost"] + 1e-12
