@@ -3,11 +3,12 @@
     python benchmarks/fuzz_plans.py [-n N] [--first I] [--seed S] [--networkx] [--quick]
 
 The problems vary the grid (holes, closed bounds), the awareness (of cells or bounds), the number of
-sets of posts, place effects, the model (equal, different or coupled robots), the objective, the family, costs of bounds,
-limits on the number of bounds, U-turns, and risks (limits, costs, components). Numbers are usual,
-large, tied or 0. The plan must have the best score of all admissible paths, which
-`peers.every_path` enumerates without code of the planner. With --networkx, the plan must also have
-the value of `peers.networkx_planner`. Problem I of a seed is always the same.
+sets of posts, place effects, the model (equal, different or coupled robots), the objective, the
+family, costs of bounds, limits on the number of bounds, U-turns, and risks (limits, costs,
+components). Numbers are usual, large, tied or 0. The plan must have the best score of all
+admissible paths, which `peers.every_path` enumerates without code of the planner. With --networkx,
+the plan must also have the value of `peers.networkx_planner`. Problem I of a seed is always the
+same.
 """
 
 import sys
@@ -183,8 +184,8 @@ def draw_problem(rng):
         failure = cost * share
     limit = options.get("max_failure", np.inf)
     return planner, params, World(
-        objective, *ends, np.tile(into, (n_posts, 1)), bound_cost.reshape(8, -1), u, B0, x0, family, sd, shortest + extra,
-        turns, risk, failure, share, limit,
+        objective, *ends, np.tile(into, (n_posts, 1)), bound_cost.reshape(8, -1), u, B0, x0,
+        family, sd, shortest + extra, turns, risk, failure, share, limit,
     )  # fmt: skip
 
 

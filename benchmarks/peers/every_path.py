@@ -1,7 +1,8 @@
 """Best plans without the planner, found by enumerating every admissible walk.
 
 This module shares no code with `trustbo.planning`. A `World` contains a problem as plain arrays
-over the ways into each cell: the eight moves with each set of posts, way = move + 8 set. All walks of the same length are extended at once.
+over the ways into each cell: the eight moves with each set of posts, way = move + 8 set. All walks
+of the same length are extended at once.
 """
 
 from itertools import pairwise
