@@ -119,6 +119,22 @@ def test_a_mission_whose_first_bound_has_other_posts_is_learned(workspace):
     assert "bound_move" in campaign.posterior["places"].coords
 
 
+def test_a_path_gets_the_sets_at_whose_posts_the_robots_stood(workspace):
+    mission = KinematicSimulator(workspace).run(ROUTE, seed=3)
+    stood = np.stack([bound.poses[0, 1:, :2] for bound in mission.bounds])
+    cells = [cell[:2] for cell in ROUTE]
+    assert workspace.with_posts(cells, stood) == ROUTE
+    assert workspace.with_posts(cells, np.full(stood.shape, np.nan)) == tuple(cells)
+
+    stood[1] += 100.0
+    with pytest.raises(tb.TrustboError, match=r"stood 1[0-9]{2} m from its post .* cell \(1, 1\)"):
+        workspace.with_posts(cells, stood)
+    with pytest.raises(tb.TrustboError, match=r"\(bound, robot, 2\) = \(3, 3, 2\); got"):
+        workspace.with_posts(cells, stood[0])
+    with pytest.raises(tb.TrustboError, match="made from a terrain"):
+        tb.Workspace.from_awareness(np.ones((3, 3, 3, 1))).with_posts(cells, stood)
+
+
 def test_trust_is_that_of_the_posts_asked_for(workspace, result):
     usual = result.trust("r1", (1, 1), move="ne")
     far = result.trust("r1", (1, 1), move="ne", posts="far")

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -21,6 +22,7 @@ from trustbo.data import (
     default_features,
     is_line_of_sight,
     require_map,
+    require_path,
 )
 from trustbo.display import Rows, Summary, announced
 from trustbo.errors import (
@@ -329,6 +331,54 @@ class Workspace(Summary):
 
         name = require_choice(f"posts of {what}", station[2], self.post_sets)
         return *locate(tuple(station[:2]), what), name
+
+    def with_posts(
+        self, path: Sequence[Cell], stood: ArrayLike, *, within: float = 10.0
+    ) -> tuple[Station, ...]:
+        """Return a path with the set of posts nearest to where T2 stood before each bound.
+
+        Robots that did not stand at the planned posts can thus tell a mission; only the set is
+        learned from, not the positions.
+
+        Args:
+            path: Cells, each a neighbour of the previous one.
+            stood: Positions of T2 at the beginning of each bound, shape (bound, robot, 2), x and y
+                in CRS metres; NaN where unknown. If all are unknown, the posts are the standard
+                ones.
+            within: Largest distance between a robot and its post, m.
+
+        Raises:
+            TrustboError: The workspace has no terrain, the shape is wrong, or a robot stood farther
+                than `within` from its posts of every set.
+
+        Example:
+            >>> stood = np.stack([bound.poses[0, 1:, :2] for bound in mission.bounds])
+            >>> dataclasses.replace(mission, path=workspace.with_posts(mission.path, stood))
+        """
+        if self.posts is None:
+            raise TrustboError("with_posts needs the posts of a workspace made from a terrain.")
+
+        cells = [self.locate((a[0], a[1]), f"path[{k}]") for k, a in enumerate(path)]
+        places = np.asarray(stood, float)
+        shape = (len(cells) - 1, self.team.n_robots, 2)
+        if places.shape != shape:
+            raise TrustboError(f"stood must be (bound, robot, 2) = {shape}; got {places.shape}.")
+
+        require_positive("within", within)
+        stations: list[Station] = []
+        for k, (a, c) in enumerate(pairwise(cells)):
+            posts = np.array([self.posts.watching((*a, name), c) for name in self.post_sets])
+            away = np.nan_to_num(np.linalg.norm(posts - places[k], axis=-1))  # (set, robot)
+            nearest = int(away.max(1).argmin())
+            if away[nearest].max() > within:
+                i = int(away[nearest].argmax())
+                raise TrustboError(
+                    f"{self.team.names[i]} stood {away[nearest, i]:.0f} m from its post of the set "
+                    f"{self.post_sets[nearest]!r} in cell {a}, and no set is nearer; increase "
+                    f"within = {within:g} m, offer more sets (n_posts), or leave this mission out."
+                )
+            stations.append((*a, self.post_sets[nearest]))
+        return require_path("path", [*stations, *cells[-1:]])
 
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the workspace's order.
