@@ -10,6 +10,7 @@ paths are enumerated, which is feasible for small grids. Neither method uses the
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import cast
 
 import networkx as nx
@@ -17,7 +18,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from trustbo.data import Cell
+from trustbo.data import Station, require_path
 from trustbo.hazard.path_risk import Risk
 from trustbo.models.draws import Draws
 from trustbo.planning.objectives import capped, has_history
@@ -74,7 +75,7 @@ def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None 
     return replace(found, exact=True, limit=found.value, seconds=seconds)
 
 
-def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cell, ...]]:
+def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Station, ...]]:
     """Find the best path for each number of bounds with `networkx.bellman_ford_path`.
 
     A bound with drift u that is followed by j more bounds adds w_j . u minus its cost to the value.
@@ -93,7 +94,7 @@ def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cel
         weights.append(carried)
 
     drift = recursion.drift.reshape(n_states, -1)
-    bound_cost = problem.bound_cost.ravel()
+    bound_cost = np.tile(problem.bound_cost.ravel(), planner.workspace.n_posts)
     n_bounds_left = graph.n_bounds_left[graph.head]  # bounds left after each edge
     cost = [
         bound_cost[b] - weights[j] @ drift[:, b]
@@ -104,7 +105,7 @@ def shortest_paths(planner: Planner, recursion: Recursion) -> Iterator[tuple[Cel
 
 def cheapest_paths(
     paths: AdmissiblePaths, cost: Sequence[float] | np.ndarray
-) -> Iterator[tuple[Cell, ...]]:
+) -> Iterator[tuple[Station, ...]]:
     """Find the path of least cost for each number of bounds.
 
     Args:
@@ -121,12 +122,14 @@ def cheapest_paths(
         except (nx.NetworkXNoPath, nx.NodeNotFound):  # every path of this length has a U-turn
             continue
 
-        cells = np.array([node[1] for node in nodes[:-1]])
-        yield (*paths.cells(cells), paths.goal)
+        stations = np.array([network.edges[edge]["station"] for edge in pairwise(nodes)])
+        yield (*paths.cells(stations), paths.goal)
 
 
 def network_of(graph: Unrolled, cost: Sequence[float] | np.ndarray) -> nx.DiGraph:
-    """Convert an unrolled graph to networkx, with the `cost` and the `bound` of each edge.
+    """Convert an unrolled graph to networkx, with the `cost` and the `station` of each edge.
+
+    Of the edges that differ only in their posts, the cheapest is kept.
 
     Every path from a node `(None, start, n_bounds_left)` to the node `"goal"` is admissible. Each
     other node is a tuple (previous cell, cell, bounds left). If U-turns are allowed, the previous
@@ -152,7 +155,9 @@ def network_of(graph: Unrolled, cost: Sequence[float] | np.ndarray) -> nx.DiGrap
             head = "goal"
             if h != 0:
                 head = onward[0], int(graph.cell[h]), int(graph.n_bounds_left[h])
-            network.add_edge(tail, head, cost=float(cost[e]), bound=int(graph.bound[e]))
+            known = network.get_edge_data(tail, head)
+            if known is None or cost[e] < known["cost"]:
+                network.add_edge(tail, head, cost=float(cost[e]), station=int(graph.station[e]))
             if h > 0 and onward not in met:
                 met.add(onward)
                 nodes.append(onward)
@@ -160,7 +165,7 @@ def network_of(graph: Unrolled, cost: Sequence[float] | np.ndarray) -> nx.DiGrap
     return network
 
 
-def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Cell]) -> float:
+def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Station]) -> float:
     """Compute the value of a path, with the expected cost of failure."""
     along = recursion.along(path)
     trust = states_along(along).mean(-1)
@@ -180,19 +185,22 @@ def _infeasible(problem: Problem, risk: Risk) -> InfeasibleError:
     )
 
 
-def every_path(paths: AdmissiblePaths) -> Iterator[tuple[Cell, ...]]:
+def every_path(paths: AdmissiblePaths) -> Iterator[tuple[Station, ...]]:
     """Enumerate all admissible paths, which is feasible only for small grids."""
     onward = cells_ahead(paths.bounds)
 
-    stack: list[tuple[Cell, ...]] = [(paths.start,)]
+    # The last cell of a path on the stack has no posts yet.
+    stack: list[tuple[Station, ...]] = [(paths.start,)]
     while stack:
         path = stack.pop()
         for cell in onward.get(path[-1], []):
             if not 0 <= paths.bounds_to_goal[cell] <= paths.longest - len(path):
                 continue
-            if not paths.turns and path[-2:-1] == (cell,):
+            if not paths.turns and len(path) > 1 and path[-2][:2] == cell:
                 continue
-            if cell == paths.goal:
-                yield (*path, cell)
-            else:
-                stack.append((*path, cell))
+            for name in paths.workspace.post_sets:
+                longer = require_path("path", [*path[:-1], (*path[-1], name), cell])
+                if cell == paths.goal:
+                    yield longer
+                else:
+                    stack.append(longer)

@@ -188,7 +188,7 @@ def test_bounds_that_cannot_be_are_named():
     for bound, message in {
         ((0, 0), (-1, 0)): r"\(-1, 0\) is outside the grid of 5 rows and 6 columns",
         ((4, 0), (5, 0)): r"\(5, 0\) is outside the grid",
-        ((0.0, 0.5), (1, 0)): r"a cell must be two whole numbers \(row, col\); got \(0.0, 0.5\)",
+        ((0.0, 0.5), (1, 0)): r"path\[0\] must be two whole numbers \(row, col\); got \(0.0, 0.5\)",
         ((0, 0), (2, 0)): "no bound leads from",
         (2, 0): r"two whole numbers \(row, col\); got 2",
         ((0, 0),): "must have 2 cells",
