@@ -13,6 +13,7 @@ same.
 
 import sys
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 from common import arguments, parsed
@@ -25,6 +26,7 @@ from trustbo.models import TrustParams
 from trustbo.models.params import CoupledParams, RobotParams
 from trustbo.planning import InfeasibleError, Planner
 from trustbo.workspace import Workspace
+from trustbo.workspace.awareness import labelled_onward
 from trustbo.workspace.moves import posts_along
 
 OBJECTIVES, FAMILIES = (
@@ -76,7 +78,10 @@ def draw_grid(rng):
 
 
 def draw_model(rng, z, kind):
-    """Draw the parameters of a model; also return drift (state, move, row, col), B0, x0 and sd."""
+    """Draw the parameters of a model; also return drift (state, way, row, col), B0, x0 and sd.
+
+    The last result is what the second feature of each robot adds to each state, (state, robot).
+    """
     n, sd = len(z), pick(rng, 0.01, 0.1, 0.4)
     beta0 = float(pick(rng, 0.0, 0.3, 0.7, 0.95, 1.0))
     x0, model = float(numbers(rng, kind)), pick(rng, "pooled", "robots", "coupled")
@@ -86,7 +91,7 @@ def draw_model(rng, z, kind):
         B = numbers(rng, kind, (2, n, n))
         u = np.einsum("mab,bdrcm->adrc", B, z) + b[:, None, None, None]
         params = CoupledParams(B0, B, b, 0.01 * np.eye(n), sd**2 * np.eye(n), x0)
-        return params, u, B0, np.full(n, x0), sd
+        return params, u, B0, np.full(n, x0), sd, B[1]
     u, places = np.zeros(z.shape[:-1]), {}
     if rng.random() < 0.3:
         k = pick(rng, 1, n)
@@ -98,11 +103,11 @@ def draw_model(rng, z, kind):
         u = u + np.einsum("im,idrcm->idrc", beta, z) + b[:, None, None, None]
         sds = sd * rng.uniform(0.5, 1.0, n)
         params = RobotParams(own, beta, b, np.full(n, 0.1), sds, x0, **places)
-        return params, u, np.diag(own), np.full(n, x0), float(sds.mean())
+        return params, u, np.diag(own), np.full(n, x0), float(sds.mean()), np.diag(beta[:, 1])
     beta = numbers(rng, kind, 2)
     params = TrustParams(beta0, beta, b[0], 0.1, sd, x0, **places)
     u = (u + z @ beta + b[0]).mean(0, keepdims=True)
-    return params, u, np.full((1, 1), beta0), np.full(1, x0), sd
+    return params, u, np.full((1, 1), beta0), np.full(1, x0), sd, np.full((1, n), beta[1] / n)
 
 
 def draw_risk(rng, shape, of_contact):
@@ -154,12 +159,22 @@ def draw_problem(rng):
         z = np.concatenate([z, np.round(others * 4.0) / 4.0], axis=1)
     by_bound = z if z.ndim == 5 else np.repeat(z[:, None], 8, axis=1)
     objective, family = pick(rng, *OBJECTIVES), pick(rng, *FAMILIES)
-    params, u, B0, x0, sd = draw_model(
+    params, u, B0, x0, sd, of_sight = draw_model(
         rng, by_bound, pick(rng, "usual", "usual", "large", "tied", "zeros")
     )
-    u = u.reshape(len(u), 8 * n_posts, -1)
+    u = np.repeat(u[..., None], 8 * n_posts + 1, axis=-1)
+    workspace = Workspace.from_awareness(z, passable)
+    if n_posts > 1:  # line of sight, the second feature, depends on the next way
+        names = "traversability", "line_of_sight"
+        workspace = Workspace.from_awareness(z, passable, features=names)
+        change = 0.3 * of_posts.normal(size=(n, 8 * n_posts, *shape, 8 * n_posts))
+        onward = labelled_onward(change, workspace.awareness)
+        workspace = replace(workspace, onward=onward)
+        known = z[..., None, 1]
+        u[..., :-1] += np.tensordot(of_sight, np.clip(known + change, 0.0, 1.0) - known, 1)
+    u = u.reshape(len(u), 8 * n_posts, -1, 8 * n_posts + 1)
     if objective == "lost_contact" and family == "gaussian":  # no bound gains contact
-        u, x0 = np.minimum(u, 1.0 - B0.sum(1)[:, None, None]), np.minimum(x0, 1.0)
+        u, x0 = np.minimum(u, 1.0 - B0.sum(1)[:, None, None, None]), np.minimum(x0, 1.0)
     ends = [int(np.ravel_multi_index(cell, shape)) for cell in (start, goal)]
     shortest, extra = int(to_goal(into, ends[1])[ends[0]]), int(rng.integers(0, 5))
     turns = rng.random() < 0.4
@@ -170,7 +185,7 @@ def draw_problem(rng):
         else draw_risk(rng, (8, *shape), objective == "lost_contact")
     )
     planner = Planner(
-        Workspace.from_awareness(z, passable), start, goal, objective, family=family,
+        workspace, start, goal, objective, family=family,
         bound_cost=bound_cost,
         max_bounds=shortest + extra if turns else f"shortest+{extra}", **options,
     )  # fmt: skip
@@ -237,7 +252,8 @@ def main():
         most = 2000 if given.networkx else _MOST_WALKS
         planner, params, world, best = problem_of(given.seed, index, most)
         wrong, exact = faults(planner, params, world, best)
-        if given.networkx and not wrong and best > -np.inf:
+        is_peers = planner.workspace.onward is None
+        if given.networkx and is_peers and not wrong and best > -np.inf:
             ours, theirs = planner.plan(params), networkx_planner.plan(planner, params)
             if abs(ours.value - theirs.value) > 1e-9 * max(1.0, abs(theirs.value)):
                 wrong.append(f"value {ours.value:.12g}, networkx {theirs.value:.12g}")

@@ -10,7 +10,6 @@ Missions have the same seeds in all methods, and each method starts from the sam
 
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +28,8 @@ METHODS: dict[str, dict[str, Any]] = {
     "running mean": {"policy": running_mean.greedy(), "model": tb.models.PooledTrust()},
     "2 sets of posts": {"n_posts": 2},
     "3 sets of posts": {"n_posts": 3},
-    "4 sets of posts": {"n_posts": 4},
-    "posts by sight": {"n_posts": 4, "only_best": True},
 }
-"""Arguments of `trustbo.iterate`, and of the workspace, keyed by method.
-
-In "posts by sight", each bound has a single set of posts: the one with the best predicted sight.
-"""
+"""Arguments of `trustbo.iterate`, and `n_posts` of the workspace, keyed by method."""
 USUAL = ("trustbo", "running mean")
 """Methods that are compared if none is given; the first is the one that others are compared to."""
 COURSES = ("sw-ne",)
@@ -86,8 +80,6 @@ def rows_of(
     for method in methods:
         options = dict(METHODS[method])
         workspace = world.workspace(n_posts=options.pop("n_posts", 1))
-        if options.pop("only_best", False):
-            workspace = with_best_posts(workspace)
         simulator = world.simulator(workspace)
         result = tb.iterate(
             workspace,
@@ -106,18 +98,6 @@ def rows_of(
         means = {"first": lost[0], "lost": np.mean(lost), "lost_last_4": np.mean(lost[-4:])}
         rows.append(labels | means | {"arrive": arrived})
     return rows
-
-
-def with_best_posts(workspace: tb.Workspace) -> tb.Workspace:
-    """Return a workspace whose bounds have no sight except from the set of posts with the most."""
-    awareness = workspace.awareness.copy()
-    is_sight = awareness["feature"].values == "line_of_sight"
-    sight = awareness.values[..., is_sight]  # (robot, way, row, col, 1)
-    by_set = sight.reshape(len(sight), workspace.n_posts, -1, *sight.shape[2:])
-    of_team = by_set.mean(0, keepdims=True)
-    best = of_team == of_team.max(1, keepdims=True)
-    awareness.values[..., is_sight] = np.where(best, by_set, 0.0 * by_set).reshape(sight.shape)
-    return replace(workspace, awareness=awareness)
 
 
 def lost_in(mission: tb.Mission) -> float:

@@ -23,7 +23,7 @@ class World(NamedTuple):
     goal: int
     into: np.ndarray  # (way, cell): the cell that the way leads to from a cell, -1 if it may not
     bound_cost: np.ndarray  # (move, cell entered), costs apart from trust
-    u: np.ndarray  # (state, way, cell entered)
+    u: np.ndarray  # (state, way, cell entered, next way or the number of ways)
     B0: np.ndarray  # (state, state)
     x0: np.ndarray  # (state,)
     family: str
@@ -75,29 +75,30 @@ def best_walk(world, most):
     TooManyError: more than `most` walks. NaN if rounding decides which are within the limit.
     """
     far = to_goal(world.into, world.goal)
-    cell, came = np.array([world.start]), np.array([NONE])
+    cell, came = np.array([world.start]), np.array([-1])  # -1: no way led here
     x, risk = world.x0[:, None], np.zeros((len(world.risk), 1))
     cost, bound_cost, scores, sums, total = np.zeros(1), np.zeros(1), [], [], 0
-    begun = np.pad(world.risk, ((0, 0), (0, 1), (0, 0), (0, 0)))  # nothing is at risk before NONE
     for k in range(1, world.longest + 1):
         way, walk = np.nonzero(world.into[:, cell] >= 0)
         other = world.into[way, cell[walk]]
         fits = far[other] <= world.longest - k
         if not world.turns:
-            fits &= (came[walk] == NONE) | (way % 8 != 7 - came[walk])
+            fits &= (came[walk] < 0) | (way % 8 != 7 - came[walk] % 8)
         way, walk, other = way[fits], walk[fits], other[fits]
         m = way % 8
         total += len(m)
         if total > most:
             raise TooManyError
-        x = world.B0 @ x[:, walk] + world.u[:, way, other]
-        last = world.loss(x.mean(0))
-        cost, bound_cost = cost[walk] + last, bound_cost[walk] + world.bound_cost[m, other]
-        # What is at risk in a bound depends on the next move, which is known only now.
-        risk = risk[:, walk] + begun[:, came[walk], cell[walk], m]
-        cell, came, there = other, m, other == world.goal
+        x, cost, risk = x[:, walk], cost[walk], risk[:, walk]
+        if k > 1:  # what happens in a bound depends on the next way, which is known only now
+            x = world.B0 @ x + world.u[:, came[walk], cell[walk], way]
+            cost = cost + world.loss(x.mean(0))
+            risk = risk + world.risk[:, came[walk] % 8, cell[walk], m]
+        bound_cost = bound_cost[walk] + world.bound_cost[m, other]
+        cell, came, there = other, way, other == world.goal
+        last = world.loss((world.B0 @ x + world.u[:, way, other, -1]).mean(0))
         ended = risk + world.risk[:, m, other, NONE]
-        scores.append(world.score(cost, last, bound_cost, ended, k)[there])
+        scores.append(world.score(cost + last, last, bound_cost, ended, k)[there])
         sums.append(-np.tensordot(world.share, np.expm1(-ended[:, there]), 1))
         on = ~there
         cell, came, x, risk = cell[on], came[on], x[:, on], risk[:, on]
@@ -110,21 +111,20 @@ def best_walk(world, most):
 
 def score_along(world, path):
     """Score of one path of (cell, set); -inf if it is not admissible or beyond the limit."""
-    x, risk, costs, bound_cost, came = world.x0, np.zeros(len(world.risk)), [], 0.0, NONE
+    x, risk, costs, bound_cost, ways = world.x0, np.zeros(len(world.risk)), [], 0.0, []
     cells = [cell for cell, _ in path]
     if cells[0] != world.start or cells[-1] != world.goal or world.goal in cells[:-1]:
         return -np.inf
     for (a, posts), (c, _) in pairwise(path):
         entering = np.flatnonzero(world.into[:8, a] == c)
-        if not len(entering) or (not world.turns and came != NONE and entering[0] == 7 - came):
+        if not len(entering) or (not world.turns and ways and entering[0] == 7 - ways[-1] % 8):
             return -np.inf
-        if came != NONE:
-            risk = risk + world.risk[:, came, a, entering[0]]
-        came = entering[0]
-        x = world.B0 @ x + world.u[:, came + 8 * posts, c]
+        ways.append(entering[0] + 8 * posts)
+        bound_cost = bound_cost + world.bound_cost[entering[0], c]
+    for way, c, after in zip(ways, cells[1:], [*ways[1:], -1], strict=True):
+        x = world.B0 @ x + world.u[:, way, c, after]
         costs.append(world.loss(x.mean()))
-        bound_cost = bound_cost + world.bound_cost[came, c]
-    risk = risk + world.risk[:, came, cells[-1], NONE]
+        risk = risk + world.risk[:, way % 8, c, NONE if after < 0 else after % 8]
     if len(costs) > world.longest or -world.share @ np.expm1(-risk) > world.limit:
         return -np.inf
     return world.score(sum(costs), costs[-1], bound_cost, risk, len(costs))

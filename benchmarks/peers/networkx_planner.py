@@ -26,7 +26,7 @@ from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.problem import InfeasibleError, Problem, mean_and_draws_of
-from trustbo.planning.recursion import Recursion, states_along
+from trustbo.planning.recursion import Recursion, states_along, trust_recursion
 from trustbo.planning.unrolled import Unrolled
 from trustbo.workspace.moves import cells_ahead
 
@@ -61,7 +61,7 @@ def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None 
     for path in paths:
         if not problem.is_within_limit(path):
             continue
-        value = _value_of(problem, recursion, path)
+        value = _value_of(problem, mean, path, x0)
         if best is None or value > best_value:
             best = path
             best_value = value
@@ -165,9 +165,13 @@ def network_of(graph: Unrolled, cost: Sequence[float] | np.ndarray) -> nx.DiGrap
     return network
 
 
-def _value_of(problem: Problem, recursion: Recursion, path: Sequence[Station]) -> float:
+def _value_of(
+    problem: Problem, mean: Draws, path: Sequence[Station], x0: ArrayLike | None
+) -> float:
     """Compute the value of a path, with the expected cost of failure."""
-    along = recursion.along(path)
+    z, bounds = problem.along(path)
+    recursion = trust_recursion(mean, z, problem.initial_trust(x0), bounds=bounds)
+    along = capped(problem.objective, problem.likelihood, recursion)
     trust = states_along(along).mean(-1)
     value = problem.value_along(problem.bound_cost_along(path), trust, along.noise_sd)
     return value.item() - problem.failure_along(path)

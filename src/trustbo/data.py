@@ -25,7 +25,7 @@ from trustbo.errors import (
 Cell = tuple[int, int]
 Station = tuple[Any, ...]
 """Cell of a path, (row, col), or (row, col, name) with the set of posts for the move out of it."""
-POST_SETS = ("standard", "far", "route", "wide")
+POST_SETS = ("standard", "far", "route")
 """Names of the sets of posts from which T2 can watch the lead's move out of a cell.
 
 A cell of a path without a name means the first set.

@@ -331,7 +331,7 @@ def test_with_a_risk_the_limit_is_on_the_states_that_know_the_bound_before(works
     planner = Planner(workspace, *ENDS, max_bounds=12)
     n_plain = len(planner.problem.paths.graph.cell)
     with_risk = planner.with_risk(np.full((8, 5, 6), 0.01))
-    assert len(with_risk.problem.paths.paired.graph.cell) > 4 * n_plain
+    assert len(with_risk.problem.paths.committed.graph.cell) > 4 * n_plain
 
     monkeypatch.setattr("trustbo.planning.paths._MOST_STATES", 2 * n_plain)
     planner = Planner(workspace, *ENDS, max_bounds=12)

@@ -65,6 +65,8 @@ def test_plans_are_the_best_of_all_paths_written_out(seed):
 def test_networkx_finds_plans_of_the_same_value(seed):
     refused = 0
     for planner, params, _, best in random_problems(seed, 50, 500):
+        if planner.workspace.onward is not None:  # networkx has no pairs of bounds
+            continue
         if best == -np.inf:
             with pytest.raises(InfeasibleError) as expected:
                 networkx_planner.plan(planner, params)

@@ -9,6 +9,8 @@ from worlds import hillside
 import trustbo as tb
 from trustbo.data import POST_SETS
 from trustbo.simulation import KinematicSimulator, Truth
+from trustbo.workspace import MOVES
+from trustbo.workspace.line_of_sight import N_SAMPLES, Geometry, bound_features
 from trustbo.workspace.moves import bounds_along, bounds_and_next, way_names
 from trustbo.workspace.posts import SETS
 
@@ -19,7 +21,7 @@ ROUTE = ((2, 0, "far"), (1, 1), (1, 2, "route"), (0, 2))
 
 @pytest.fixture(scope="module")
 def workspace():
-    return tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=4)
+    return tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=3)
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +59,31 @@ def test_posts_keep_the_distances_of_their_set(workspace, name):
     np.testing.assert_array_equal(posts.watching((1, 1, name), None), posts.watching((1, 1), None))
 
 
+def test_the_change_by_the_next_way_is_that_of_the_line_of_sight(workspace):
+    """Against `bound_features`, which closes up to one set of posts, for random pairs of bounds."""
+    posts = workspace.posts
+    pairs = np.argwhere(np.isfinite(workspace.onward.values).all(0))
+    some = pairs[np.random.default_rng(0).permutation(len(pairs))[:300]]
+    given = {"routes": [], "posts": [], "ends": [], "stops": []}
+    for way, row, col, after in some.tolist():
+        (down, right), (i, j) = MOVES[way % 8], MOVES[after % 8]
+        a, c, b = (row - down, col - right), (row, col), (row + i, col + j)
+        given["routes"].append(posts.lead_line(a, c))
+        given["posts"].append(posts.watching((*a, POST_SETS[way // 8]), c))
+        end = posts.watching((*c, POST_SETS[after // 8]), b)
+        given["ends"].append(np.repeat(end[None], N_SAMPLES, axis=0))
+        given["stops"].append(posts.stop(c))
+
+    geometry = Geometry(given["routes"], *map(np.array, (given[k] for k in list(given)[1:])))
+    everywhere = np.ones(posts.surface.ground.shape)
+    exact, _ = bound_features(posts.surface, posts.sight, posts.team, geometry, everywhere)
+    sight = workspace.of_pairs(some)[..., -1].T
+    usual = workspace.awareness.values[:, *some[:, :3].T, -1].T
+    off = exact - sight
+    assert np.sqrt(np.mean(off**2)) < 0.6 * np.sqrt(np.mean((exact - usual) ** 2))
+    assert abs(off.mean()) < 0.005
+
+
 def test_ways_are_moves_with_a_set_of_posts():
     np.testing.assert_array_equal(bounds_along(ROUTE), [[2 + 8, 1, 1], [4, 1, 2], [1 + 16, 0, 2]])
     plain = [cell[:2] for cell in ROUTE]
@@ -69,7 +96,9 @@ def test_a_mission_measures_the_awareness_of_its_posts(workspace):
     assert mission.path == ROUTE
     assert [bound.cell for bound in mission.bounds] == [(1, 1), (1, 2), (0, 2)]
     of_path = workspace.awareness.values[:, [10, 4, 17], [1, 1, 0], [1, 2, 2]]
-    np.testing.assert_array_equal(mission.awareness, np.swapaxes(of_path, 0, 1))
+    of_path[:, :2, -1] += workspace.onward.values[:, [10, 4], [1, 1], [1, 2], [4, 17]]
+    expected = np.swapaxes(np.clip(of_path, 0.0, 1.0), 0, 1)
+    np.testing.assert_allclose(mission.awareness, expected, rtol=0.0, atol=1e-12)
 
     first = mission.bounds[0].poses[0, 1:, :2]
     off = np.linalg.norm(first - workspace.posts.watching((2, 0, "far"), (1, 1)), axis=1)
@@ -106,7 +135,8 @@ def test_a_stored_campaign_with_sets_resumes_as_if_it_had_not_stopped(workspace,
     folder = tmp_path / "campaign"
     tb.iterate(workspace, *ENDS, simulator=simulator, n_iterations=2, seed=1, directory=folder)
     again = tb.resume(folder, n_iterations=3, simulator=simulator)
-    assert again.workspace.n_posts == 4
+    assert again.workspace.n_posts == 3
+    assert again.workspace.onward.identical(workspace.onward)
     paths = [mission.path for mission in result.missions]
     assert [mission.path for mission in again.missions] == paths
     assert again.plan.path == result.plan.path
@@ -172,7 +202,7 @@ def test_sets_that_a_workspace_does_not_offer_are_refused():
     two = tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=2)
     with pytest.raises(tb.TrustboError, match=r"posts of path\[2\] 'route'; choose one of"):
         two.along(ROUTE)
-    with pytest.raises(tb.TrustboError, match="n_posts must be at most 4"):
+    with pytest.raises(tb.TrustboError, match="n_posts must be at most 3"):
         tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=5)
     with pytest.raises(tb.TrustboError, match="n_posts > 1 needs line of sight"):
         tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=2, bounds=False)

@@ -11,8 +11,11 @@ from trustbo.errors import require_whole
 from trustbo.models.draws import Draws
 from trustbo.planning.objectives import capped
 from trustbo.planning.problem import EXACT, Problem
-from trustbo.planning.recursion import Recursion, states_along
+from trustbo.planning.recursion import states_along, trust_recursion
 from trustbo.workspace.moves import cells_along
+
+_NUMBERS = 4_000_000
+"""Largest number of drifts (draw, pair) that are computed at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,12 +24,12 @@ class DrawnPaths:
 
     Attributes:
         problem: Planning problem.
-        recursion: Recursion for expected trust, with leading axis (draw,).
+        draws: Parameter draws.
         paths: Stations of each path, shape (draw, cell); see `AdmissiblePaths.cells`.
     """
 
     problem: Problem
-    recursion: Recursion
+    draws: Draws
     paths: np.ndarray
 
     @cached_property
@@ -46,13 +49,13 @@ class DrawnPaths:
         which = self._distinct[1]
         for i, path in enumerate(self.candidates):
             best = which == i
-            values[best] = self._value(Recursion(*(value[best] for value in self.recursion)), path)
+            values[best] = self._value(self.draws.draw(best), path)
 
         return values
 
     def values_of(self, paths: Sequence[Sequence[Station]]) -> np.ndarray:
         """Return the value of each given path under every draw, shape (draw, path)."""
-        return np.stack([self._value(self.recursion, path) for path in paths], axis=1)
+        return np.stack([self._value(self.draws, path) for path in paths], axis=1)
 
     def regret(self, path: Sequence[Station]) -> np.ndarray:
         """Return the best value of each draw minus the value of the given path, shape (draw,)."""
@@ -84,10 +87,12 @@ class DrawnPaths:
             )
         return count / len(self.paths)
 
-    def _value(self, recursion: Recursion, path: Sequence[Station]) -> np.ndarray:
-        """Compute the value of a path for each draw of `recursion`, shape (draw,)."""
+    def _value(self, draws: Draws, path: Sequence[Station]) -> np.ndarray:
+        """Compute the value of a path for each draw, shape (draw,)."""
         problem = self.problem
-        along = capped(problem.objective, problem.likelihood, recursion.along(path))
+        z, bounds = problem.along(path)
+        recursion = trust_recursion(draws, z, problem.initial_trust(None), bounds=bounds)
+        along = capped(problem.objective, problem.likelihood, recursion)
         trust = states_along(along).mean(-1)
         value = problem.value_along(problem.bound_cost_along(path), trust, along.noise_sd)
         return value - problem.failure_along(path)
@@ -115,7 +120,12 @@ def choose_draws(params: Draws, n_draws: int | None, seed: int) -> Draws:
 
 
 def drawn_paths(problem: Problem, draws: Draws) -> DrawnPaths:
-    """Find the best path for each draw."""
-    recursion = problem.recursion(draws)
-    _, _, paths = problem.best(recursion)
-    return DrawnPaths(problem, recursion, paths)
+    """Find the best path for each draw; the draws are processed in parts, to limit memory use."""
+    size = draws.n_draws
+    if problem.paths.workspace.n_posts > 1:
+        size = max(1, _NUMBERS // len(problem.paths.pairs))
+    parts = [
+        problem.best(problem.searched(draws.draw(slice(first, first + size))))[2]
+        for first in range(0, draws.n_draws, size)
+    ]
+    return DrawnPaths(problem, draws, np.concatenate(parts))

@@ -11,7 +11,6 @@ from trustbo.planning.objectives import capped
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.planning.problem import Problem
 from trustbo.planning.recursion import states_along, trust_recursion
-from trustbo.workspace.moves import along, bounds_along
 
 
 def evaluated(
@@ -63,8 +62,7 @@ def _value_along(
     The values do not include the expected cost of failure.
     """
     x0 = problem.initial_trust(x0)
-    z = along(problem.paths.workspace.awareness.values, path)
-    bounds = bounds_along(path)
+    z, bounds = problem.along(path)
 
     by_robot = trust_recursion(params, z, x0, bounds=bounds, by_robot=True)
     trust = states_along(by_robot)

@@ -52,10 +52,13 @@ def best_labels(
         Costs (draw,), lower bounds on the cost of any path (draw,), and paths (draw, cell) as
         indices of stations, padded with -1. A cost is inf if no path is within the limit.
     """
+    n_bounds = graph.n_bounds_left[graph.starts]
+    divisor = scale[n_bounds[:1]]
     searches = [graph]
-    divisor = scale[graph.n_bounds_left[graph.starts]]
-    if not (divisor == divisor[0]).all():  # one search for each number of bounds
-        searches = [graph._replace(starts=graph.starts[k : k + 1]) for k in range(len(divisor))]
+    if not (scale[n_bounds] == divisor).all():  # one search for each number of bounds
+        lengths = np.unique(n_bounds)
+        divisor = scale[lengths]
+        searches = [graph._replace(starts=graph.starts[n_bounds == n]) for n in lengths]
 
     n = len(costs.drift)
     max_labels = MAX_LABELS  # an argument, because a compiled kernel keeps its globals

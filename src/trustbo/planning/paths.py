@@ -11,10 +11,16 @@ from scipy.sparse.csgraph import dijkstra
 
 from trustbo.data import POST_SETS, Cell, Station, require_path
 from trustbo.errors import TrustboError, one_line, require_kind, require_whole
-from trustbo.planning.unrolled import Paired, Unrolled, paired
+from trustbo.planning.unrolled import Committed, Unrolled, committed
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import MOVES, cells_along, moves_along, require_on_grid
+from trustbo.workspace.moves import (
+    MOVES,
+    cells_along,
+    moves_along,
+    possible_next,
+    require_on_grid,
+)
 
 SIMPLE_EXTRA = 2
 """Largest number of bounds beyond the fewest for which all paths without U-turns are simple.
@@ -199,10 +205,31 @@ class AdmissiblePaths:
         return Unrolled(cell, n_bounds_left, first, head, bound, station, starts, self.turns)
 
     @cached_property
-    def paired(self) -> Paired:
-        """Unrolled graph whose edges know the bound before them, for risks; see `graph`."""
-        self._require_size(len(self.graph.head))  # every edge leads to another of its states
-        return paired(self.graph, self.bounds[0].size)
+    def committed(self) -> Committed:
+        """Unrolled graph whose edges know the next way, for risks and posts; see `graph`."""
+        graph = self.graph
+        self._require_size(len(graph.head))  # every edge becomes a state
+        n_cells = self.bounds[0].size
+        if self.workspace.n_posts == 1:
+            return committed(graph, n_cells, None)
+
+        n_ways = len(self.bounds) * self.workspace.n_posts
+        number = np.full((n_ways, n_cells, n_ways + 1), -1, np.int32)
+        way, row, col, after = self.pairs.T
+        number[way, row * self.bounds.shape[2] + col, after] = np.arange(len(way))
+        return committed(graph, n_cells, number)
+
+    @cached_property
+    def pairs(self) -> np.ndarray:
+        """Way, row and column of each bound, with each next way, shape (pair, 4).
+
+        The next way is the number of ways at the end of a path.
+        """
+        n_posts = self.workspace.n_posts
+        follows = possible_next(self.bounds)  # (move, row, col, next_move)
+        onward = np.tile(follows[..., :-1], (n_posts, 1, 1, n_posts))
+        ends = np.tile(follows[..., -1:], (n_posts, 1, 1, 1))
+        return np.argwhere(np.concatenate([onward, ends], axis=-1))
 
     def _require_size(self, n_states: int) -> None:
         """Raise TrustboError if a graph with this number of states is too large."""

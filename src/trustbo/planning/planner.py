@@ -277,7 +277,7 @@ class Planner(Summary):
         self.problem.require_family(params)
         with stopwatch() as elapsed:
             mean, draws = mean_and_draws_of(params, self.workspace)
-            score, limits, paths = self.problem.best(self.problem.recursion(mean, x0))
+            score, limits, paths = self.problem.best(self.problem.searched(mean, x0))
             plan = evaluated(self.problem, self.problem.paths.cells(paths[0]), mean, draws, x0)
             seconds = elapsed()
 
@@ -289,7 +289,7 @@ class Planner(Summary):
         """Find the best admissible path for a given recursion, such as one with optimistic drifts.
 
         Args:
-            recursion: Recursion for expected trust with one draw (see `Problem.recursion`).
+            recursion: Recursion for expected trust with one draw (see `Problem.searched`).
 
         Raises:
             TrustboError: If beta0 is outside the range in which the search is exact.

@@ -75,7 +75,7 @@ def optimistic(
     require_share("quantile", quantile)
 
     some = choose_draws(params, _N_DRIFTS, _seed(rng))
-    drawn = planner.problem.recursion(some)
+    drawn = planner.problem.searched(some)
     optimistic = Recursion(
         transition=drawn.transition.mean(0, keepdims=True),
         drift=np.quantile(drawn.drift, quantile, axis=0, keepdims=True),
@@ -151,9 +151,11 @@ def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
     """
     _require(rng, params, planner)
 
+    paths = planner.problem.paths
+    shape = paths.bounds.shape if paths.workspace.n_posts == 1 else paths.pairs.shape[:1]
     recursion = Recursion(
         transition=np.zeros((1, 1, 1)),
-        drift=rng.uniform(size=(1, 1, *planner.workspace.awareness.shape[1:-1])),
+        drift=rng.uniform(size=(1, 1, *shape)),
         start=np.zeros((1, 1)),
         noise_sd=np.full(1, 0.1),  # matters only for censored rates
     )

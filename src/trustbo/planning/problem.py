@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled, require_numbers
-from trustbo.data import Cell
+from trustbo.data import Cell, Station
 from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.hazard.path_risk import ROUNDING, Risk
 from trustbo.inference.learner import next_mission_of
@@ -23,7 +23,14 @@ from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.recursion import Recursion, trust_recursion
 from trustbo.planning.sums import best_sums
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import END, MOVE_NAMES, NEXT_NAMES, bounds_and_next, possible_next
+from trustbo.workspace.moves import (
+    END,
+    MOVE_NAMES,
+    NEXT_NAMES,
+    bounds_and_next,
+    pairs_along,
+    possible_next,
+)
 
 EXACT = 1e-12
 """Tolerance: a path is optimal if its score is within this distance of the upper limit."""
@@ -134,7 +141,12 @@ class Problem:
                 f"{self.likelihood.name!r}; use Planner(..., family={fitted.name!r})."
             )
 
-    def bound_cost_along(self, path: Sequence[Cell] | np.ndarray) -> float:
+    def along(self, path: Sequence[Station] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the awareness (robot, bound, feature) and the bounds (bound, 3) of a path."""
+        pairs = pairs_along(path, self.paths.workspace.n_posts)
+        return self.paths.workspace.of_pairs(pairs), pairs[:, :3]
+
+    def bound_cost_along(self, path: Sequence[Station] | np.ndarray) -> float:
         """Sum the costs of the bounds of a path."""
         return float(self.bound_cost[*bounds_and_next(path).T[:3]].sum())
 
@@ -154,7 +166,7 @@ class Problem:
         scale = objective.scale(np.array([float(n_bounds)]))[0]
         return objective.value((trust @ credit - bound_cost) / scale)
 
-    def failure_along(self, path: Sequence[Cell] | np.ndarray) -> float:
+    def failure_along(self, path: Sequence[Station] | np.ndarray) -> float:
         """Compute the expected cost of failure of a path, in bounds."""
         if not self.risk or not self.cost_of_failure:
             return 0.0
@@ -195,7 +207,7 @@ class Problem:
         constant = float(credit[0] * trust[is_last].max())
         return bound_cost + np.where(is_last, constant - credit[0] * trust, 0.0), constant
 
-    def is_within_limit(self, path: Sequence[Cell] | np.ndarray) -> bool:
+    def is_within_limit(self, path: Sequence[Station] | np.ndarray) -> bool:
         """Return whether a path respects `max_failure`."""
         if self.max_failure is None or self.risk is None:
             return True
@@ -207,6 +219,19 @@ class Problem:
         """Build the recursion for expected trust (see `trust_recursion`)."""
         z = self.paths.workspace.awareness.values
         return trust_recursion(params, z, self.initial_trust(x0), by_robot=by_robot)
+
+    def searched(self, params: Draws, x0: ArrayLike | None = None) -> Recursion:
+        """Build the recursion for `best`.
+
+        With several sets of posts, its drift (draw, state, pair) is that of `paths.pairs`.
+        """
+        if self.paths.workspace.n_posts == 1:
+            return self.recursion(params, x0)
+
+        pairs = self.paths.pairs
+        z = self.paths.workspace.of_pairs(pairs)
+        params.require_grid(self.paths.bounds.shape[1:])
+        return trust_recursion(params, z, self.initial_trust(x0), bounds=pairs[:, :3])
 
     def initial_trust(self, x0: ArrayLike | None) -> np.ndarray | None:
         """Read expected trust at the start, shape () or (..., robot), by the robots' names."""
@@ -248,11 +273,11 @@ class Problem:
             )
 
         limit = np.inf if self.max_failure is None else self.max_failure + ROUNDING
-        risks = self.paths.paired.of_edges(risks_by_bound(p_fail))
+        risks = risks_by_bound(p_fail)[self.paths.committed.risk]
         return EdgeRisks(risks, self.cost_of_failure, weights, limit)
 
     def best(self, recursion: Recursion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the best admissible path for each draw of the recursion.
+        """Find the best admissible path for each draw of the recursion from `searched`.
 
         Returns:
             Scores (draw,), upper limits on the score of any path (draw,), and paths (draw, cell),
@@ -267,10 +292,16 @@ class Problem:
         self._require_valid(recursion, history)
         recursion = capped(self.objective, self.likelihood, recursion)
 
-        graph = self.paths.graph if self.edge_risks is None else self.paths.paired.graph
+        graph = self.paths.graph
+        bound_cost = self.bound_cost.ravel()
+        if self.paths.workspace.n_posts > 1:
+            way, row, col, _ = self.paths.pairs.T
+            bound_cost = self.bound_cost[way % END, row, col]
+        if self.paths.workspace.n_posts > 1 or self.edge_risks is not None:
+            graph = self.paths.committed.graph
+
         n_draws, n_states = recursion.start.shape
         drift = recursion.drift.reshape(n_draws, n_states, -1)
-        bound_cost = np.tile(self.bound_cost.ravel(), self.paths.workspace.n_posts)
         state_weights = np.full(n_states, 1.0 / n_states)
         weights = weights_of(self.objective, recursion, state_weights, graph.longest)
 
@@ -313,10 +344,9 @@ class Problem:
         Returns:
             The path, and its failure probability, which accounts for the components of the risk.
         """
-        paired = self.paths.paired
-        graph = paired.graph
+        graph, of_edges = self.paths.committed
         p_fail, weights = cast("Risk", self.risk).searched
-        n_bounds = self.bound_cost.size * self.paths.workspace.n_posts
+        n_bounds = int(graph.bound.max()) + 1
         n = graph.longest + 1
 
         # No bound costs anything, and a failure costs 1.
@@ -329,7 +359,7 @@ class Problem:
             x0=np.zeros((1, 0)),
             sd=np.ones(1),
             bound_cost=np.zeros(n_bounds),
-            risk=paired.of_edges(risks_by_bound(p_fail)),
+            risk=risks_by_bound(p_fail)[of_edges],
             failure=weights,
             share=weights,
             limit=np.inf,
@@ -371,8 +401,8 @@ class Problem:
 class EdgeRisks(NamedTuple):
     """EdgeRisks -log(1 - p_fail) of the bounds, which the search sums along a path.
 
-    `of_edges` (edge, component) contains the risks of the bounds that each edge of `paths.paired`
-    completes, with one column per component of the risk. If the risks of a path add up to r_m in
+    `of_edges` (edge, component) contains the risk of the bound of each edge of `paths.committed`,
+    with one column per component of the risk. If the risks of a path add up to r_m in
     column m, it fails with probability sum_m w_m (1 - exp(-r_m)), where `weights` (component,)
     contains the w_m. This probability must not exceed `limit`, and a failure costs
     `cost_of_failure`.

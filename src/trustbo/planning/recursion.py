@@ -39,11 +39,6 @@ class Recursion(NamedTuple):
             start=self.start.mean(1, keepdims=True),
         )
 
-    def along(self, path: Sequence[Cell] | np.ndarray) -> "Recursion":
-        """Return the recursion with the drift of a path's bounds, (draw, state, bound)."""
-        ways, rows, cols = bounds_along(path).T
-        return self._replace(drift=self.drift[..., ways, rows, cols])
-
     def steady_state(self) -> np.ndarray:
         """Return the limit of the team's trust if a bound is repeated, (draw, move, row, col)."""
         return self.steady_states().mean(1)

@@ -48,88 +48,64 @@ class Unrolled(NamedTuple):
         return int(self.n_bounds_left[-1])
 
 
-class Paired(NamedTuple):
-    """Unrolled graph for costs that depend on a bound and on the next move.
+class Committed(NamedTuple):
+    """Unrolled graph for costs that depend on a bound and on the way that follows it.
 
-    A state of `graph` is a state of the plain graph together with the bound that led to it, so each
-    edge knows the bound before it. U-turns are excluded by leaving out their edges.
+    A state of `graph` is a state of the plain graph together with the way out of it, so each edge
+    knows the next way. U-turns are excluded by leaving out their edges.
 
     Attributes:
         graph: Unrolled graph; its attribute `turns` is True, as no search has to exclude U-turns.
-        completed: Flat index into (move, row, col, next_move) of the bound before each edge, with
-            the move of the edge as the next move, shape (edge,); -1 if the edge leaves the start.
-        last: The same index for the edge's own bound if it enters the goal, otherwise -1, shape
-            (edge,).
+        risk: Flat index into (move, row, col, next_move) of the bound of each edge, shape (edge,).
     """
 
     graph: Unrolled
-    completed: np.ndarray
-    last: np.ndarray
-
-    def of_edges(self, values: np.ndarray) -> np.ndarray:
-        """Add up values of bounds with their next moves over the bounds that each edge completes.
-
-        Args:
-            values: Values (bound, ...), where the index of a bound is a flat index into (move, row,
-                col, next_move).
-
-        Returns:
-            Sums (edge, ...). The total along a path counts each bound of the path once.
-        """
-        nothing = np.zeros((1, *values.shape[1:]))
-        padded = np.concatenate([values, nothing])  # the index -1
-        return padded[self.completed] + padded[self.last]
+    risk: np.ndarray
 
 
-def paired(graph: Unrolled, n_cells: int) -> Paired:
-    """Add the bound that led to each state to the states of a graph.
+def committed(graph: Unrolled, n_cells: int, number: np.ndarray | None) -> Committed:
+    """Add the way out of each state to the states of a graph.
 
     Args:
         graph: Plain graph.
         n_cells: Number of cells of the grid.
+        number: Index of each bound and next way, shape (way, cell, next way), where the last next
+            way is the end of the path. It becomes `bound` of the edges. None to keep `bound`.
     """
-    n_moves = END
-    way, entered = np.divmod(graph.bound.astype(np.int64), n_cells)
-    move = way % n_moves  # move of each edge; risks do not depend on the posts
+    way, entered = np.divmod(graph.bound, n_cells)
+    move = way % END
 
-    # The key of a state is `number of the plain state` x 9 + `move that led there`, where 8 stands
-    # for the start. These keys keep the order of the states. All ways to enter the goal form one
-    # state.
-    width = n_moves + 1
-    onward = np.where(graph.head > 0, graph.head.astype(np.int64) * width + move, 0)
-    begun = graph.starts.astype(np.int64) * width + n_moves
-    keys = np.unique(np.concatenate([[0], begun, onward]))
-    plain_state, came_by = np.divmod(keys, width)
-
-    # Repeat the edges of each plain state for each move that led there.
-    n_edges = np.diff(graph.first)[plain_state]
-    tail = np.repeat(np.arange(len(keys)), n_edges)
-    before = np.cumsum(n_edges) - n_edges
-    edge = np.arange(len(tail)) - before[tail] + graph.first[plain_state[tail]]
+    # A plain edge becomes a state, whose index is that of the edge + 1; state 0 is the goal. Each
+    # plain edge is repeated for each one that can follow, or once if it enters the goal (-1).
+    n_after = np.where(graph.head > 0, np.diff(graph.first)[graph.head], 1)
+    edge = np.repeat(np.arange(len(way)), n_after)
+    number_after = np.arange(len(edge)) - np.repeat(np.cumsum(n_after) - n_after, n_after)
+    head = graph.head[edge]
+    after = np.where(head > 0, graph.first[head] + number_after, -1)
     if not graph.turns:
-        is_kept = move[edge] != n_moves - 1 - came_by[tail]  # the reverse of move m is move 7 - m
-        tail, edge = tail[is_kept], edge[is_kept]
+        is_kept = (after < 0) | (move[after] != END - 1 - move[edge])  # the reverse of m is 7 - m
+        edge, after = edge[is_kept], after[is_kept]
 
-    first = np.searchsorted(tail, np.arange(len(keys) + 1))
-    head = np.searchsorted(keys, onward[edge]).astype(np.int32)
+    is_last = after < 0
+    next_move = np.where(is_last, END, move[after])
+    bound = graph.bound[edge]
+    if number is not None:
+        bound = number[way[edge], entered[edge], np.where(is_last, -1, way[after])]
 
-    left = graph.cell[plain_state[tail]]  # the cell in which the bound before the edge ended
-    by = came_by[tail]
-    completed = np.where(by < n_moves, (by * n_cells + left) * width + move[edge], -1)
-    own = (move[edge] * n_cells + entered[edge]) * width + END
-    last = np.where(head == 0, own, -1)
-
+    tail = np.repeat(np.arange(len(graph.cell)), np.diff(graph.first))
+    ends = [np.arange(*graph.first[s : s + 2]) + 1 for s in graph.starts]
     whole = Unrolled(
-        cell=graph.cell[plain_state],
-        n_bounds_left=graph.n_bounds_left[plain_state],
-        first=first,
-        head=head,
-        bound=graph.bound[edge],
+        cell=np.concatenate([graph.cell[:1], graph.cell[tail]]),
+        n_bounds_left=np.concatenate([graph.n_bounds_left[:1], graph.n_bounds_left[tail]]),
+        first=np.searchsorted(edge + 1, np.arange(len(way) + 2)),
+        head=(after + 1).astype(np.int32),
+        bound=bound,
         station=graph.station[edge],
-        starts=np.searchsorted(keys, begun).astype(graph.starts.dtype),
+        starts=np.concatenate(ends).astype(graph.starts.dtype),
         turns=True,
     )
-    return Paired(whole, completed, last)
+    cell = (move[edge].astype(np.int64) * n_cells + entered[edge]) * (END + 1)
+    return Committed(whole, cell + next_move)
 
 
 class ToGo(NamedTuple):

@@ -198,6 +198,14 @@ def labelled(
     )
 
 
+def labelled_onward(onward: np.ndarray, awareness: xr.DataArray) -> xr.DataArray:
+    """Label the change of line of sight (robot, way, row, col, next way); see `labelled`."""
+    like = awareness.isel(feature=0, drop=True).expand_dims(
+        next_move=awareness["move"].values, axis=-1
+    )
+    return like.copy(data=onward).rename("onward")
+
+
 def unlabelled(
     awareness: ArrayLike | xr.DataArray, names: Sequence[str], features: Sequence[str]
 ) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:

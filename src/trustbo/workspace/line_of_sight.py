@@ -12,8 +12,8 @@ where p is the detection probability under the assumed model of sight, T_1 is th
 time and T_2 is the driving time of the slowest robot. A robot that arrives earlier waits at its
 post. The assumed next cell changes with k, so that all cells ahead are represented.
 
-Each set of posts in a has its own line of sight. T2 is assumed to close up to the standard posts in
-c, so that line of sight does not depend on the set that is chosen there.
+Each set of posts in a has its own line of sight, in which T2 closes up to the standard posts in c.
+`onward_maps` computes how line of sight changes with the next cell and with the set chosen there.
 
 The lead takes the fastest route, as in the simulator. T2 is assumed to follow that route, shifted
 to T2's posts. Finding T2's own fastest routes would take about 50 searches for each bound. These
@@ -30,7 +30,7 @@ import numpy as np
 from trustbo.data import POST_SETS, Cell, Station
 from trustbo.parallel import in_order
 from trustbo.team import Robot, Team
-from trustbo.workspace.moves import MOVES, existing_bounds
+from trustbo.workspace.moves import MOVES, existing_bounds, possible_next
 from trustbo.workspace.posts import Posts
 from trustbo.workspace.routes import at_times
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
@@ -39,6 +39,8 @@ from trustbo.workspace.surface import Surface
 _BLOCK = 256  # bounds computed together, to limit memory use
 N_SAMPLES = 16
 """Number of times at which sight is computed in each phase of a bound."""
+_N_OF_PAIRS = 12  # number of these times in each phase, for each next way
+_PAIRS = 4096  # pairs of a bound and a next way computed together
 _AHEAD = 0.5  # cosine of the largest turn after which a cell counts as ahead
 
 
@@ -76,6 +78,95 @@ def bound_maps(
         for one, values in zip(maps, features, strict=True):
             one[:, *bounds] = values.T
     return maps[0], maps[1]
+
+
+def onward_maps(posts: Posts, passable: np.ndarray, n_posts: int) -> np.ndarray:
+    """Compute the change of line of sight by the next way, for several sets of posts.
+
+    Returns:
+        Line of sight if T2 closes up to the posts of the next way, minus the mean over the cells
+        ahead with standard posts, shape (robot, way, row, col, next way), in single precision; NaN
+        where the bound or the next bound does not exist.
+    """
+    exists = existing_bounds(passable)
+    watching = _posts_of_ways(posts, exists, n_posts)
+    pairs = np.argwhere(np.tile(possible_next(exists)[..., :-1], (n_posts, 1, 1, n_posts)))
+    n_ways = len(MOVES) * n_posts
+    robots = posts.team.robots
+    maps = np.full((len(robots), n_ways, *passable.shape, n_ways), np.nan, np.float32)
+
+    def of_block(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return block.T, _sight_of_pairs(posts, watching, block)
+
+    blocks = np.array_split(pairs, max(1, math.ceil(len(pairs) / _PAIRS)))
+    for where, seen in in_order(of_block, blocks):
+        maps[:, *where] = seen.T
+
+    for way, row, col in np.argwhere(np.tile(exists, (n_posts, 1, 1))).tolist():
+        down, right = MOVES[way % len(MOVES)]
+        a = row - down, col - right
+        ahead = [b for b in _cells_ahead(passable, a, (row, col)) if b is not None]
+        moves = [MOVES.index((b[0] - row, b[1] - col)) for b in ahead]
+        if moves:
+            maps[:, way, row, col] -= maps[:, way, row, col, moves].mean(-1, keepdims=True)
+    return maps
+
+
+def _posts_of_ways(posts: Posts, exists: np.ndarray, n_posts: int) -> np.ndarray:
+    """Return the posts from which T2 watches each way out of a cell, (way, row, col, robot, 2)."""
+    n_robots = len(posts.team.robots)
+    places = np.full((len(MOVES) * n_posts, *exists.shape[1:], n_robots, 2), np.nan)
+    for move, row, col in np.argwhere(exists).tolist():
+        down, right = MOVES[move]
+        a = row - down, col - right
+        for number, name in enumerate(POST_SETS[:n_posts]):
+            places[move + len(MOVES) * number, *a] = posts.watching((*a, name), (row, col))
+    return places
+
+
+def _sight_of_pairs(posts: Posts, watching: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Compute the line of sight (pair, robot) of ways, rows, columns and next ways (pair, 4)."""
+    # What does not depend on the next way is computed once for each bound and set of posts.
+    bounds, index = np.unique(pairs[:, :3], axis=0, return_inverse=True)
+    way = bounds[:, 0]
+    left = bounds[:, 1:] - np.array(MOVES)[way % len(MOVES)]
+    from_posts = watching[way, *left.T]  # (bound, robot, 2)
+    cells = [
+        (tuple(a), tuple(c)) for a, c in zip(left.tolist(), bounds[:, 1:].tolist(), strict=True)
+    ]
+    routes = [posts.lead_line(*bound) for bound in cells]
+
+    surface, sight, lead = posts.surface, posts.sight, posts.team.lead
+    lead_route, lead_time = _timed(surface, lead, routes, _N_OF_PAIRS)
+    drives = [_timed(surface, robot, routes, _N_OF_PAIRS) for robot in posts.team.robots]
+    watched = []
+    for i, robot in enumerate(posts.team.robots):
+        eye = from_posts[:, i, None] + jittered(_N_OF_PAIRS)
+        view = optics(robot, lead)
+        found = detection_between(surface, sight, eye, lead_route, view).mean(1)
+        watched.append(robot.detection * lead_time * found)
+
+    start = from_posts[index]
+    end = watching[pairs[:, 3], *pairs[:, 1:3].T]
+    stop = np.array([posts.stop(c) for _, c in cells])[index]
+    first, last = (np.stack([route[k] for route in routes])[index] for k in (0, -1))
+
+    distance = np.linalg.norm(end - start, axis=-1).mean(1)
+    longer = distance / np.maximum(np.linalg.norm(last - first, axis=1), 1.0)
+    times = np.stack([time[index] for _, time in drives], axis=1) * longer[:, None]
+    slowest = times.max(1)
+    share = ((np.arange(_N_OF_PAIRS) + 0.5) / _N_OF_PAIRS)[:, None]
+
+    seen = np.empty(times.shape)
+    for i, (robot, (route, _)) in enumerate(zip(posts.team.robots, drives, strict=True)):
+        shift = (1.0 - share) * (start[:, i] - first)[:, None] + share * (end[:, i] - last)[:, None]
+        places = np.concatenate([route[index] + shift, end[:, i, None]], axis=1)
+        view = optics(lead, robot)
+        found = lead.detection * detection_between(surface, sight, stop[:, None], places, view)
+        closing, waiting = found[:, :-1].mean(1), found[:, -1]
+        seen[:, i] = times[:, i] * closing + (slowest - times[:, i]) * waiting
+        seen[:, i] += watched[i][index]
+    return seen / (lead_time[index] + slowest)[:, None]
 
 
 def geometry(posts: Posts, index: np.ndarray, passable: np.ndarray) -> Geometry:
@@ -161,8 +252,8 @@ def bound_features(
 
 
 def _timed(
-    surface: Surface, robot: Robot, routes: Sequence[np.ndarray]
+    surface: Surface, robot: Robot, routes: Sequence[np.ndarray], n_samples: int = N_SAMPLES
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a robot's positions (bound, sample, 2) on routes, and the durations (bound,), s."""
     first = np.cumsum([0, *(len(route) for route in routes)])
-    return at_times(surface, robot, np.concatenate(routes), first, N_SAMPLES)
+    return at_times(surface, robot, np.concatenate(routes), first, n_samples)

@@ -89,6 +89,15 @@ def bounds_and_next(path: Sequence[Station] | np.ndarray) -> np.ndarray:
     return np.column_stack([bounds, np.append(bounds[1:, 0], END)])
 
 
+def pairs_along(path: Sequence[Station] | np.ndarray, n_posts: int) -> np.ndarray:
+    """Return the way, row, column and next way of each bound of a path, shape (bound, 4).
+
+    The next way of the last bound is the number of ways.
+    """
+    bounds = bounds_along(path)
+    return np.column_stack([bounds, np.append(bounds[1:, 0], len(MOVES) * n_posts)])
+
+
 def possible_next(bounds: np.ndarray) -> np.ndarray:
     """Return whether each bound can be followed by each next move, (move, row, col, next_move).
 

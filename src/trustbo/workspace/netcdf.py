@@ -24,6 +24,8 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
     Attributes of the terrain that netCDF cannot store become JSON.
     """
     cells = xr.Dataset({"awareness": workspace.awareness, "passable": workspace.passable})
+    if workspace.onward is not None:
+        cells["onward"] = workspace.onward
     tree = {"cells": cells}
     tree |= {f"composites/{n}": index.fitted for n, index in workspace.composites.items()}
 
@@ -78,9 +80,9 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
         for name, node in nodes.items()
     }
 
-    return Workspace(
-        cells["awareness"], cells["passable"], grid, team, terrain, pixels, composites, posts
-    )
+    maps = cells["awareness"], cells["passable"]
+    onward = cells.get("onward")
+    return Workspace(*maps, grid, team, terrain, pixels, composites, posts, onward)
 
 
 def difficulty_to_tree(difficulty: Difficulty) -> xr.DataTree:

@@ -82,7 +82,6 @@ SETS = dict(
             _STANDARD,
             PostSet(radius=60.0, gap=20.0, nearer=0.0),
             PostSet(radius=35.0, gap=8.0, watching=0.9),
-            PostSet(radius=40.0, gap=12.0, nearer=0.0),
         ),
         strict=True,
     )

@@ -40,6 +40,7 @@ from trustbo.terrain.read import require_terrain
 from trustbo.workspace.awareness import (
     cell_maps,
     labelled,
+    labelled_onward,
     of_arrays,
     of_moves,
     options_of,
@@ -49,7 +50,8 @@ from trustbo.workspace.awareness import (
 )
 from trustbo.workspace.difficulty import Difficulty
 from trustbo.workspace.grid import MAX_MISSING, Grid, Location
-from trustbo.workspace.moves import MOVE_NAMES, MOVES, along, existing_bounds
+from trustbo.workspace.line_of_sight import onward_maps
+from trustbo.workspace.moves import MOVE_NAMES, MOVES, existing_bounds, pairs_along
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface, surface_of
@@ -73,6 +75,9 @@ class Workspace(Summary):
         pixels: Dataset (y, x) of each feature, float32, and of `passable`; None without a terrain.
         composites: Fitted composite indices, keyed by feature.
         posts: The robots' stops, posts and routes on the terrain; None without a terrain.
+        onward: DataArray (robot, move, row, col, next_move), the change of line of sight by the
+            next move and by the set of posts that is used there; NaN where there is no such move.
+            None with one set of posts, which predicts the mean over the next moves.
 
     Example:
         >>> terrain = tb.terrain.example()
@@ -88,6 +93,7 @@ class Workspace(Summary):
     pixels: xr.Dataset | None = None
     composites: dict[str, CompositeIndex] = field(default_factory=dict)
     posts: Posts | None = None
+    onward: xr.DataArray | None = None
 
     @classmethod
     def from_terrain(
@@ -124,12 +130,12 @@ class Workspace(Summary):
             bounds: If False, define awareness for cells only, as in the paper, without line of
                 sight and with the visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight; by default `Sight()`.
-            n_posts: Number of sets of posts, 1 to 4, from which T2 can watch the lead in each
+            n_posts: Number of sets of posts, 1 to 3, from which T2 can watch the lead in each
                 bound. With more than one, planners choose a set in each cell of a path together
                 with the cells. The sets are, in this order: "standard"; "far", up to 60 m from the
-                lead's stop and 20 m apart; "route", mostly for the sight of the lead's route; and
-                "wide", up to 40 m from the stop and 12 m apart. Line of sight and traversability
-                differ between sets; the difficulty of driving is that of the standard one.
+                lead's stop and 20 m apart; and "route", mostly for the sight of the lead's route.
+                Line of sight and traversability differ between sets; the difficulty of driving is
+                that of the standard one.
 
         Raises:
             TrustboError: The dataset is not a terrain, the grid is too fine for the raster, all
@@ -172,13 +178,17 @@ class Workspace(Summary):
             # Bounds.
             z = np.repeat(of_moves(cells, passable)[None], team.n_robots, axis=0)
             names = [*features]
+            onward = None
             if bounds:
                 z = with_line_of_sight(z, pixels, passable, posts, n_posts)
                 names.append(LINE_OF_SIGHT)
+            if n_posts > 1:
+                onward = onward_maps(posts, passable, n_posts)
 
         maps = labelled(z, passable, grid, team, names)
         pixels = pixels.assign(passable=drivable)
-        return cls(*maps, grid, team, terrain, pixels, composites, posts)
+        more = None if onward is None else labelled_onward(onward, maps[0])
+        return cls(*maps, grid, team, terrain, pixels, composites, posts, more)
 
     @classmethod
     def from_awareness(
@@ -322,7 +332,25 @@ class Workspace(Summary):
             raise TrustboError("path must contain at least one cell; got none.")
 
         cells = [self._station(station, f"path[{k}]", locate) for k, station in enumerate(path)]
-        return np.swapaxes(along(self.awareness.values, cells), 0, 1)
+        return np.swapaxes(self.of_pairs(pairs_along(cells, self.n_posts)), 0, 1)
+
+    def of_pairs(self, pairs: np.ndarray) -> np.ndarray:
+        """Return the awareness (robot, pair, feature) of bounds with given next ways.
+
+        Args:
+            pairs: Way, row, column and next way (pair, 4), where the next way is the number of ways
+                at the end of a path; see `workspace.moves`.
+        """
+        way, row, col, after = pairs.T
+        z = self.awareness.values[:, way, row, col]
+        if self.onward is None:
+            return z
+
+        goes_on = after < len(self.onward["next_move"])
+        change = self.onward.values[:, way, row, col, np.where(goes_on, after, 0)]
+        seen = z[..., self.features.index(LINE_OF_SIGHT)]
+        seen += np.where(goes_on, change, 0.0)
+        return np.clip(z, 0.0, 1.0)
 
     def _station(self, station: Any, what: str, locate: Callable[[Any, str], Cell]) -> Station:
         """Find the cell of a station; raises TrustboError if its set of posts is not offered."""
