@@ -231,6 +231,11 @@ class AdmissiblePaths:
         ends = np.tile(follows[..., -1:], (n_posts, 1, 1, 1))
         return np.argwhere(np.concatenate([onward, ends], axis=-1))
 
+    @cached_property
+    def awareness_of_pairs(self) -> np.ndarray:
+        """Awareness of `pairs`, shape (robot, pair, feature)."""
+        return np.ascontiguousarray(self.workspace.of_pairs(self.pairs))
+
     def _require_size(self, n_states: int) -> None:
         """Raise TrustboError if a graph with this number of states is too large."""
         if n_states > _MOST_STATES:

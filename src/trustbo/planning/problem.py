@@ -228,10 +228,10 @@ class Problem:
         if self.paths.workspace.n_posts == 1:
             return self.recursion(params, x0)
 
-        pairs = self.paths.pairs
-        z = self.paths.workspace.of_pairs(pairs)
+        z = self.paths.awareness_of_pairs
+        bounds = self.paths.pairs[:, :3]
         params.require_grid(self.paths.bounds.shape[1:])
-        return trust_recursion(params, z, self.initial_trust(x0), bounds=pairs[:, :3])
+        return trust_recursion(params, z, self.initial_trust(x0), bounds=bounds)
 
     def initial_trust(self, x0: ArrayLike | None) -> np.ndarray | None:
         """Read expected trust at the start, shape () or (..., robot), by the robots' names."""
