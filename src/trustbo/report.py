@@ -30,6 +30,7 @@ _SHOWN = 3
 _ENDS = {"n_iterations": "all missions were run", "interrupted": "none; more missions can be run"}
 _OF_BOUNDS = {
     "cell": "cell",
+    "posts": "posts",
     "x": "x (m)",
     "y": "y (m)",
     "trust": "expected trust",

@@ -210,6 +210,22 @@ def test_sets_that_a_workspace_does_not_offer_are_refused():
         Truth.from_simulator(KinematicSimulator(two)).lost(ROUTE[:2])
 
 
+def test_no_other_set_of_a_bound_makes_the_plan_better(workspace, result):
+    table = result.compare_posts()
+    n_bounds = len(result.plan.path) - 1
+    assert table.index.get_level_values("bound").unique().tolist() == [*range(1, n_bounds + 1)]
+    assert (table["chosen"].groupby("bound").sum() == 1).all()
+    best = table.groupby("bound")["value"].max()
+    np.testing.assert_allclose(
+        table.query("chosen")["value"].droplevel(1), best, rtol=0, atol=1e-12
+    )
+
+    other = [(*result.plan.path[0][:2], "far"), *result.plan.path[1:]]
+    expected = result.planner.evaluate(other, result.belief.mean())
+    assert table.loc[(1, "far"), "value"] == pytest.approx(expected.value)
+    assert table.loc[(1, "far"), "trust"] == pytest.approx(expected.trust[0].mean())
+
+
 def test_a_graph_has_an_edge_for_each_set(workspace, result):
     graph = result.planner.graph(result.posterior)
     assert graph.is_multigraph()

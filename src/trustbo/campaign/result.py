@@ -291,6 +291,17 @@ class Result(Summary):
         draws = self._ahead.of_robots(expected=expected)
         return self._base.trust(draws, robot, cell, move=move, posts=posts, as_rate=as_rate)
 
+    def compare_posts(self) -> pd.DataFrame:
+        """Compare the sets of posts in each bound of the recommended path.
+
+        Returns:
+            Table of `Planner.compare_posts`, with the expected effects of robots.
+
+        Example:
+            >>> result.compare_posts().query("chosen")
+        """
+        return self.planner.compare_posts(self.plan.path, self.belief)
+
     def robot_maps(self, *, expected: bool = False) -> xr.Dataset:
         """Compute maps of the trust in each robot in the next mission.
 

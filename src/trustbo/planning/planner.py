@@ -7,11 +7,12 @@ from typing import Any, Self
 
 import networkx as nx
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled
-from trustbo.data import POST_SETS, Cell, Station
+from trustbo.data import POST_SETS, Cell, Station, require_path
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
     TrustboError,
@@ -339,6 +340,41 @@ class Planner(Summary):
         path = self.require_path(path)
         draws = draws_of(params, self.workspace).drawn
         return evaluated(self.problem, path, draws, None, x0)
+
+    @computing()
+    def compare_posts(self, path: Sequence[Station], params: Draws | xr.DataTree) -> pd.DataFrame:
+        """Compare the sets of posts in each bound of a path.
+
+        Args:
+            path: Cells from start to goal, such as `Plan.path`.
+            params: Posterior from `fit`, or parameters. Several draws are replaced by their mean.
+
+        Returns:
+            Table with one row for each bound of the path, from 1, and each set of posts, which
+            index it. The columns are whether the path has the set (`chosen`); the team's expected
+            trust after the bound (`trust`) and in the whole path (`value`, the objective) if T2
+            watches this bound from the set and the other bounds as in the path.
+
+        Raises:
+            TrustboError: The path is not admissible, or the parameters do not fit the workspace.
+
+        Example:
+            >>> planner.compare_posts(plan.path, posterior).loc[1]
+        """
+        path = self.require_path(path)
+        self.problem.require_family(params)
+        mean = mean_of(params, self.workspace)
+
+        rows = []
+        for k in range(1, len(path)):
+            cell = path[k - 1][:2]
+            for name in self.workspace.post_sets:
+                other = require_path("path", [*path[: k - 1], (*cell, name), *path[k:]])
+                plan = evaluated(self.problem, other, mean, None, None)
+                rows.append((k, name, other == path, plan.trust[k - 1].mean(), plan.value))
+
+        columns = ["bound", "posts", "chosen", "trust", "value"]
+        return pd.DataFrame(rows, columns=columns).set_index(["bound", "posts"])
 
     @computing()
     def graph(self, params: Draws | xr.DataTree) -> nx.DiGraph | nx.MultiDiGraph:
