@@ -22,6 +22,7 @@ from .campaign import resume as resume
 from .criticism import check as check
 from .data import Bound as Bound
 from .data import Mission as Mission
+from .data import Sighting as Sighting
 from .errors import PosteriorError as PosteriorError
 from .errors import TrustboError as TrustboError
 from .inference import compare as compare

@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pandas as pd
@@ -19,6 +19,7 @@ from trustbo.errors import (
     require_finite,
     require_list,
     require_order,
+    require_positive,
     require_whole,
 )
 
@@ -41,12 +42,35 @@ _USUAL_LEVELS = 7
 """Number of levels of the scales "likert" and "ordinal"."""
 LINE_OF_SIGHT = "line_of_sight"
 """Feature name of the predicted contact rate; `line_of_sight_1`, `_2`, ... for several."""
+THREAT = "threat"
+"""Feature name of the exposure to a threat, from 0 to 1; see `Workspace.with_threat`."""
 MEASURED = ("awareness", "contact_rate", "duration", "n_ticks")
 """Names of the arrays of a mission, which have the axes bound and robot."""
 _DIMS = ("bound", "robot", "feature")
 """Axes of awareness, in order; the other arrays have the first two."""
 _COLUMNS = (*MEASURED, "bound_status", "starts", "poses", "contact")
 """What a mission holds of each bound, in the order of the attributes of `Bound` after the cell."""
+
+
+class Sighting(NamedTuple):
+    """Place at which a robot saw a threat during a mission, such as a jammer.
+
+    Attributes:
+        x: Easting in CRS metres.
+        y: Northing in CRS metres.
+        sd: Standard deviation of the place in each direction, m.
+        robot: Name of the robot that saw it; empty if unknown.
+        t: Time since the mission's start, s; NaN if unknown.
+
+    Example:
+        >>> mission = dataclasses.replace(mission, sightings=[tb.Sighting(1748100.0, 5427300.0)])
+    """
+
+    x: float
+    y: float
+    sd: float = 20.0
+    robot: str = ""
+    t: float = np.nan
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -133,6 +157,7 @@ class Mission(Summary):
             that are fitted together. Places on different maps have independent effects.
         poses: Poses of the team at the ticks of each bound, as in `Bound`; None where not recorded.
         contact: Contact at the ticks of each bound, as in `Bound`; None where not recorded.
+        sightings: Places at which robots saw a threat; see `planning.threat_map`.
 
     Raises:
         TrustboError: The bounds do not fit the path, the arrays disagree on the number of bounds,
@@ -163,6 +188,7 @@ class Mission(Summary):
     map: str = ""
     poses: tuple[np.ndarray | None, ...] = ()
     contact: tuple[np.ndarray | None, ...] = ()
+    sightings: tuple[Sighting, ...] = ()
 
     def __post_init__(self) -> None:
         for status in (self.status, *self.bound_status):
@@ -173,6 +199,7 @@ class Mission(Summary):
         kept: dict[str, Any] = {
             "path": require_path("path", self.path),
             "bound_status": tuple(self.bound_status),
+            "sightings": _require_sightings(self.sightings),
         }
         kept |= self._measurements() | self._ticks()
 
@@ -448,6 +475,18 @@ class Mission(Summary):
         return tuple(Bound(*values) for values in zip(cells, *columns, strict=True))
 
 
+def _require_sightings(given: Any) -> tuple[Sighting, ...]:
+    """Return sightings with places as floats; raises TrustboError if one is not a place."""
+    found = []
+    for k, one in enumerate(require_list("sightings", given, tuple, "give Sighting(x, y)")):
+        sighting = Sighting(*one)
+        what = f"sightings[{k}]"
+        numbers = {name: require_finite(f"{what}.{name}", getattr(sighting, name)) for name in "xy"}
+        sd = require_positive(f"{what}.sd", sighting.sd)
+        found.append(sighting._replace(sd=sd, **numbers))
+    return tuple(found)
+
+
 def levels_of(scale: object) -> int:
     """Return the number of levels of a scale; 0 for "unit".
 
@@ -485,6 +524,11 @@ def require_path(what: str, value: object) -> tuple[Station, ...]:
 def path_text(path: Iterable[Station]) -> str:
     """Write cells as on the command line: "9,0 8,1", or "9,0,far 8,1" with a set of posts."""
     return " ".join(",".join(map(str, cell)) for cell in path)
+
+
+def is_predicted(feature: str) -> bool:
+    """Return whether a feature is computed from the map and never measured by robots."""
+    return is_line_of_sight(feature) or feature == THREAT
 
 
 def is_line_of_sight(feature: str) -> bool:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.data import POST_SETS, Mission
+from trustbo.data import POST_SETS, Mission, Sighting
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, interpreting, read_file, to_path, write_file
 from trustbo.stacking import require_same_team
@@ -131,6 +131,14 @@ def missions_to_tree(missions: Iterable[Mission]) -> xr.DataTree:
         variables[name] = (dims, values, {"units": units})
     if cells != steps:
         variables["posts"] = "step", [(*station, POST_SETS[0])[2] for station in steps]
+    sightings = [(j, *s) for j, mission in enumerate(missions) for s in mission.sightings]
+    if sightings:
+        numbers, *columns = zip(*sightings, strict=True)
+        variables["sighted_in"] = "sighting", [*numbers]
+        variables |= {
+            f"sighting_{name}": ("sighting", [*values])
+            for name, values in zip(Sighting._fields, columns, strict=True)
+        }
     for name in _TEXTS:
         variables[name] = ("mission", [getattr(mission, name) for mission in missions])
 
@@ -165,6 +173,13 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
     table.setdefault("map", np.full(len(table["status"]), ""))  # not in files of version 0.5
     columns |= {name: table[name].tolist() for name in _TEXTS}
     names = {name: tuple(table[name].tolist()) for name in ("robot", "feature")}
+
+    sightings: list[list[Sighting]] = [[] for _ in table["n_bounds"]]
+    if "sighted_in" in table:
+        values = (table[f"sighting_{name}"].tolist() for name in Sighting._fields)
+        for j, *one in zip(table["sighted_in"].tolist(), *values, strict=True):
+            sightings[j].append(Sighting(*one))
+    columns["sightings"] = sightings
     return [
         Mission(
             robots=names["robot"],

@@ -11,7 +11,7 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 
-from trustbo.data import is_line_of_sight
+from trustbo.data import THREAT, is_line_of_sight
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
     TrustboError,
@@ -30,6 +30,7 @@ from trustbo.models.scores import log_density
 # `Priors.from_features`).
 _SIGHT_SD = 0.3
 _FEATURE_SD = 0.25
+_LOST_TO_THREAT = 0.5  # expected loss of stationary trust per unit of the feature `threat`
 _INTERCEPT_SD = 0.15
 _MEMORY = (2.0, 6.0)
 """Parameters of the Beta prior on beta0 with line of sight. With more weight near 1, constant
@@ -163,11 +164,11 @@ class Priors(Summary):
         The feature `line_of_sight` predicts the contact rate. Stationary trust therefore has prior
         slope 1 in this feature, or in the mean of n such features (`line_of_sight_1`, ...). Divided
         by 1 - beta0, the weights of these features have the prior N(1 / n, 0.3^2 / n), other
-        weights have N(0, 0.25^2), and the intercept has N(0, 0.15^2). Line of sight explains trust
-        without much memory, so beta0 ~ Beta(2, 6). Most rates drawn from these
-        priors are in [0, 1]. The floor of the noise has the prior f_v ~ Beta(1, 2) for Gaussian
-        rates. For tick counts, the priors are scaled by 5, and a line of sight of
-        0.5 predicts a rate of 0.5. If there is no such feature, the priors are those of `default`.
+        weights have N(0, 0.25^2), or N(-0.5, 0.25^2) for `threat`, and the intercept has N(0,
+        0.15^2). Line of sight explains trust without much memory, so beta0 ~ Beta(2, 6). Most rates
+        drawn from these priors are in [0, 1]. The floor of the noise has the prior f_v ~ Beta(1, 2)
+        for Gaussian rates. For tick counts, the priors are scaled by 5, and a line of sight of 0.5
+        predicts a rate of 0.5. If there is no such feature, the priors are those of `default`.
         """
         features = require_order("features", features)
         features = require_list("features", features, str, "give the names of the features")
@@ -181,11 +182,12 @@ class Priors(Summary):
         n = int(is_sight.sum())
         slope, zero = FAMILIES[family].line_of_sight
         with own_flags():
+            is_threat = np.array([name == THREAT for name in features])
             sd = np.where(is_sight, _SIGHT_SD / np.sqrt(n), _FEATURE_SD)
             return replace(
                 default,
                 beta0=_built(dist.Beta, *_MEMORY),
-                beta=dist.Normal(slope * is_sight / n, slope * sd),
+                beta=dist.Normal(slope * (is_sight / n - _LOST_TO_THREAT * is_threat), slope * sd),
                 b=dist.Normal(-slope * zero, slope * _INTERCEPT_SD),
                 f_v=_built(dist.Beta, *_FLOOR) if FAMILIES[family].gaussian else None,
                 stationary=True,

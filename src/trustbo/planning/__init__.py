@@ -8,6 +8,7 @@ from trustbo.planning.planner import Planner
 from trustbo.planning.policies import POLICIES
 from trustbo.planning.problem import InfeasibleError
 from trustbo.planning.recursion import expected_trust
+from trustbo.planning.threats import threat_map
 
 __all__ = [
     "OBJECTIVES",
@@ -18,5 +19,6 @@ __all__ = [
     "Planner",
     "expected_trust",
     "policies",
+    "threat_map",
 ]  # fmt: skip
 __dir__ = __all__.copy  # tab completion lists only public names

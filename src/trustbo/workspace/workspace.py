@@ -16,11 +16,12 @@ from trustbo.data import (
     FEATURES,
     LINE_OF_SIGHT,
     POST_SETS,
+    THREAT,
     Cell,
     Mission,
     Station,
     default_features,
-    is_line_of_sight,
+    is_predicted,
     require_map,
     require_path,
 )
@@ -55,6 +56,7 @@ from trustbo.workspace.moves import MOVE_NAMES, MOVES, existing_bounds, pairs_al
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface, surface_of
+from trustbo.workspace.threats import exposure_of
 
 _MIDDLE = (0.1, 0.9)
 """Quantiles at the ends of the middle 80 % of bounds."""
@@ -360,6 +362,37 @@ class Workspace(Summary):
         name = require_choice(f"posts of {what}", station[2], self.post_sets)
         return *locate(tuple(station[:2]), what), name
 
+    def with_threat(self, threat: xr.Dataset | None = None) -> Self:
+        """Return a workspace with the feature `threat`, the exposure of each bound to a threat.
+
+        The exposure is 0 far from a threat and 1 at its place, averaged over a threat map. Trust
+        is expected to fall by 0.5 per unit of it, so plans avoid the threat before they have
+        learned its effect. Begin a campaign with `with_threat()`, in which the feature is 0. When a
+        threat appears, go on with a new campaign that has the earlier one as `earlier`.
+
+        Args:
+            threat: Map of `planning.threat_map`; None for no threat.
+
+        Raises:
+            TrustboError: The map is that of another grid.
+
+        Example:
+            >>> workspace = workspace.with_threat()
+            >>> campaign = tb.Campaign(workspace, (9, 0), (0, 9))
+        """
+        exposure = np.zeros(self.passable_bounds.shape)
+        if threat is not None:
+            exposure = exposure_of(self.grid, threat)
+        of_ways = np.tile(exposure, (self.n_posts, 1, 1))
+
+        names = [name for name in self.features if name != THREAT]
+        known = self.awareness.sel(feature=names)
+        added = known.isel(feature=[0]).assign_coords(feature=[THREAT])
+        exists = np.isfinite(added.values)
+        values = np.where(exists, of_ways[None, ..., None], np.nan)
+        awareness = xr.concat([known, added.copy(data=values)], "feature")
+        return dataclasses.replace(self, awareness=awareness.rename("awareness"))
+
     def with_posts(
         self, path: Sequence[Cell], stood: ArrayLike, *, within: float = 10.0
     ) -> tuple[Station, ...]:
@@ -411,7 +444,8 @@ class Workspace(Summary):
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the workspace's order.
 
-        Line of sight is predicted, not measured, and is NaN if it is missing in the mission.
+        Line of sight and the exposure to a threat are predicted, not measured, and are NaN if they
+        are missing in the mission.
         Features with the default names z3, z4, ... get the workspace's names, in order.
 
         Raises:
@@ -428,7 +462,7 @@ class Workspace(Summary):
             )
             mission = dataclasses.replace(mission, features=named)
 
-        predicted = [name for name in self.features if is_line_of_sight(name)]
+        predicted = [name for name in self.features if is_predicted(name)]
         return mission.in_order(self.team.names, self.features, predicted)
 
     def fill(self, mission: Mission) -> Mission:
