@@ -5,7 +5,8 @@
 
 Unlike benchmarks/worlds.py, this script needs no truths: the contact lost is that which the
 missions measured, in bounds per mission, with bounds that failed or were not reached as fully lost.
-Missions have the same seeds in all methods, and each method starts from the same prior.
+Missions have the same seeds in all methods, and each method starts from the same prior. The column
+`settled` of the rows is the number of missions after which the planned path did not change again.
 """
 
 import sys
@@ -95,6 +96,9 @@ def rows_of(
         lost = [lost_in(mission) for mission in result.missions]
         labels = {"world": world.name, "kind": world.kind, "course": course, "method": method}
         arrived = np.mean([mission.status == "ok" for mission in result.missions])
+        paths = [*(entry.plan.path for entry in result.state.entries), result.plan.path]
+        changes = [k for k in range(1, len(paths)) if paths[k] != paths[k - 1]]
+        labels["settled"] = max(changes, default=0)
         means = {"first": lost[0], "lost": np.mean(lost), "lost_last_4": np.mean(lost[-4:])}
         rows.append(labels | means | {"arrive": arrived})
     return rows
