@@ -9,7 +9,7 @@ from trustbo import stacking
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.models.observations import Observations
-from trustbo.workspace.moves import bounds_along
+from trustbo.workspace.moves import MOVES, bounds_along
 
 RATES = "contact_rate"
 """Name of the site and of the input that contain the contact rates."""
@@ -117,7 +117,10 @@ def _inputs_of(
     features: Sequence[str],
     measurements: dict[str, np.ndarray],
 ) -> dict[str, Any]:
-    """Return the inputs by name, without padding."""
+    """Return the inputs by name, without padding; bounds have the moves of their ways."""
+    bounds = bounds.copy()
+    known = bounds[..., 0] >= 0
+    bounds[known, 0] %= len(MOVES)
     return {
         "awareness": awareness,
         **measurements,

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, ClassVar, Self
 
+import jax
 import numpy as np
 import numpyro.distributions as dist
 from numpy.typing import ArrayLike
@@ -196,8 +197,11 @@ class PlaceEffect(Effect):
 
 @cache
 def _prior_of_floor(b: float) -> dist.Distribution:
-    """Return Beta(1, b); it takes JAX some time to make it."""
-    with own_settings():
+    """Return Beta(1, b); it takes JAX some time to make it.
+
+    It is the same within a NumPyro function that JAX traces, whose values must not leave it.
+    """
+    with own_settings(), jax.ensure_compile_time_eval():
         return dist.Beta(1.0, b)
 
 
