@@ -203,5 +203,6 @@ def test_an_effect_with_nested_settings_is_rebuilt_as_it_was():
 def test_a_prior_that_is_first_made_in_a_traced_function_can_be_used_outside():
     """NumPyro functions make effects while JAX traces them, and the prior is made only once."""
     _prior_of_floor.cache_clear()
-    jax.jit(lambda x: x + PlaceEffect().hyperpriors()["f_e"].mean)(1.0)
-    assert float(PlaceEffect().hyperpriors()["f_e"].mean) == pytest.approx(1.0 / 3.0)
+    jax.jit(lambda x: x + PlaceEffect().hyperpriors()["f_e"].log_prob(x))(0.5)
+    density = PlaceEffect().hyperpriors()["f_e"].log_prob(0.75)  # of Beta(1, 2)
+    assert float(density) == pytest.approx(np.log(2.0 * (1.0 - 0.75)), rel=1e-6)
