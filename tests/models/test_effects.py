@@ -11,6 +11,7 @@ from missions import walking_missions
 from trustbo.data import Mission
 from trustbo.inference.fit import fit
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect
+from trustbo.models.backend import own_settings
 from trustbo.models.effects.place import _prior_of_floor
 from trustbo.models.record import effects_from_record, model_to_record
 
@@ -203,6 +204,7 @@ def test_an_effect_with_nested_settings_is_rebuilt_as_it_was():
 def test_a_prior_that_is_first_made_in_a_traced_function_can_be_used_outside():
     """NumPyro functions make effects while JAX traces them, and the prior is made only once."""
     _prior_of_floor.cache_clear()
-    jax.jit(lambda x: x + PlaceEffect().hyperpriors()["f_e"].log_prob(x))(0.5)
-    density = PlaceEffect().hyperpriors()["f_e"].log_prob(0.75)  # of Beta(1, 2)
+    with own_settings():
+        jax.jit(lambda x: x + PlaceEffect().hyperpriors()["f_e"].log_prob(x))(0.5)
+        density = PlaceEffect().hyperpriors()["f_e"].log_prob(0.75)  # of Beta(1, 2)
     assert float(density) == pytest.approx(np.log(2.0 * (1.0 - 0.75)), rel=1e-6)
