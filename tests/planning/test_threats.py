@@ -135,6 +135,17 @@ def test_plans_avoid_a_threat_before_they_have_learned_its_effect(workspace, mis
     assert exposed["known"] < 0.8 * exposed["unknown"]
 
 
+def test_a_campaign_goes_on_after_a_threat_appeared(workspace, missions, posterior):
+    campaign = tb.Campaign(workspace, (3, 0), (3, 6))
+    for mission in missions[3:]:
+        path = mission.path if mission.path[0] == (3, 0) else None
+        if path is not None:
+            campaign.tell(mission)
+    known = workspace.with_threat(threat_map(missions, posterior, workspace))
+    again = tb.Campaign(known, (3, 0), (3, 6), earlier=campaign)
+    assert [mission.map for mission in again.state.earlier.missions] == [""]  # the same places
+
+
 def test_sightings_are_stored_with_their_missions(missions, tmp_path):
     seen = (Sighting(1.0, 2.0, 3.0, "r2", 4.0), Sighting(5.0, 6.0))
     log = [missions[0], dataclasses.replace(missions[1], sightings=seen)]

@@ -5,6 +5,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from trustbo.data import THREAT
 from trustbo.files import to_json
 from trustbo.workspace.workspace import Workspace
 
@@ -27,7 +28,8 @@ def map_name(workspace: Workspace) -> str:
     }
     arrays = {"passable": workspace.passable.values}
     if workspace.terrain is None or workspace.pixels is None:
-        arrays["awareness"] = workspace.awareness.values
+        names = [name for name in workspace.features if name != THREAT]  # threats come and go
+        arrays["awareness"] = workspace.awareness.sel(feature=names).values
     else:
         of_terrain = {"dem": workspace.terrain["dem"], "dsm": workspace.terrain["dsm"]}
         of_pixels = {name: workspace.pixels[name] for name in map(str, workspace.pixels)}
