@@ -82,9 +82,8 @@ class DrawnPaths:
         """Return the fraction of draws whose best path contains each cell, shape (row, col)."""
         count = np.zeros(self.problem.paths.bounds.shape[1:])
         for path, n in zip(self.candidates, self.counts, strict=True):
-            count[tuple(cells_along(path).T)] += (
-                n  # adds n once, even if a path enters the cell twice
-            )
+            # Adds n once, even if a path enters the cell twice.
+            count[tuple(cells_along(path).T)] += n
         return count / len(self.paths)
 
     def _value(self, draws: Draws, path: Sequence[Station]) -> np.ndarray:

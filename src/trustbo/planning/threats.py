@@ -21,7 +21,7 @@ import numpy as np
 import xarray as xr
 from scipy.linalg import cho_factor, cho_solve
 
-from trustbo.data import Mission, Sighting, require_map, sight_columns
+from trustbo.data import THREAT, Mission, Sighting, require_map, sight_columns
 from trustbo.errors import TrustboError, require_kind, require_share
 from trustbo.inference.learner import params_of
 from trustbo.models.draws import PLACES
@@ -118,7 +118,8 @@ def _residuals(
 
     rest, number, bounds, sight, ticks = [], [], [], [], []
     for k, mission in enumerate(missions):
-        z = np.swapaxes(mission.awareness, 0, 1)
+        z = np.swapaxes(mission.awareness, 0, 1).copy()
+        z[..., [name == THREAT for name in workspace.features]] = 0.0  # it is to be explained
         along = bounds_along(mission.driven)
         expected = states_along(trust_recursion(plain, z, bounds=along, by_robot=True))[0]
         rate = mission.contact_rate
