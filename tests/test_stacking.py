@@ -57,6 +57,15 @@ def posterior(missions):
 
 
 @pytest.fixture(scope="module")
+def placed(driven):
+    """A posterior with effects of places, and the workspace of the missions in `driven`."""
+    simulator, missions = driven
+    workspace = simulator.workspace
+    model = tb.models.default_model()
+    return few_draws(missions[:4], model=model, workspace=workspace), workspace
+
+
+@pytest.fixture(scope="module")
 def people():
     z = np.random.default_rng(0).uniform(size=(4, 3, 1, 2))
     y = np.random.default_rng(1).uniform(0.2, 0.8, size=(4, 3, 1))
@@ -97,10 +106,12 @@ CALLS = {
     "ReplaySimulator": lambda m, r: tb.logs.to_frame(tb.simulation.ReplaySimulator(m).missions),
     "HumanTrust.observations": lambda m, r: tb.models.HumanTrust().observations(m).contact_rate,
     "RealtimeAwareness": lambda m, r: tb.simulation.RealtimeAwareness(r("driven")[0], m).describe(),
+    "threat_map": lambda m, r: tb.planning.threat_map(m, *r("placed"))["probability"],
     "predict_reports": lambda m, r: tb.inference.predict_reports(r("of_people"), m, n_draws=20),
 }
 """Calls with missions that return what they depend on."""
-OTHERS = {"RealtimeAwareness": "driven", "HumanTrust.observations": "people",
+OTHERS = {"RealtimeAwareness": "driven", "threat_map": "driven",
+          "HumanTrust.observations": "people",
           "predict_reports": "people"}  # fmt: skip
 """Fixtures of calls that need other missions."""
 

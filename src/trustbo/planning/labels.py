@@ -134,6 +134,9 @@ class Labels(NamedTuple):
 @kernel
 def _search(graph, costs, max_labels, edge_cost, limits, known):
     """Search for the best path; return its cost, or a lower limit if there are too many labels."""
+    if len(graph.starts) > max_labels:
+        return limits.lower
+
     n_numbers = 1 + len(costs.failure) + len(costs.x0)
     made = np.empty((4, max_labels), np.int64)
     last = np.full(len(graph.cell), -1)

@@ -15,7 +15,7 @@ shape. A sighting multiplies the probability of q by its normal density, or is f
 probability 0.05.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import xarray as xr
@@ -28,6 +28,7 @@ from trustbo.models.draws import PLACES
 from trustbo.models.effects.place import matern
 from trustbo.models.sight_scale import scale_at, variation
 from trustbo.planning.recursion import states_along, trust_recursion
+from trustbo.stacking import list_of_missions
 from trustbo.workspace import MOVES, Workspace
 from trustbo.workspace.moves import bounds_along
 from trustbo.workspace.threats import REACHES, exposures
@@ -42,7 +43,7 @@ _MISFIT = 0.15
 
 
 def threat_map(
-    missions: Sequence[Mission],
+    missions: Iterable[Mission],
     posterior: xr.DataTree,
     workspace: Workspace,
     *,
@@ -70,6 +71,7 @@ def threat_map(
         >>> float(threat["probability"].sum())  # probability of a threat
         >>> workspace.with_threat(threat)  # for the next campaign
     """
+    missions = list_of_missions(missions)
     require_kind("posterior", posterior, xr.DataTree, "give a posterior from fit")
     require_map("a threat map", missions)
     require_share("prior", prior, ends=False)

@@ -95,7 +95,8 @@ def pairs_along(path: Sequence[Station] | np.ndarray, n_posts: int) -> np.ndarra
     The next way of the last bound is the number of ways.
     """
     bounds = bounds_along(path)
-    return np.column_stack([bounds, np.append(bounds[1:, 0], len(MOVES) * n_posts)])
+    after = np.append(bounds[:, 0], len(MOVES) * n_posts)[1:]
+    return np.column_stack([bounds, after])
 
 
 def possible_next(bounds: np.ndarray) -> np.ndarray:
