@@ -119,28 +119,33 @@ def _residuals(
     plain = draws._with(arrays=arrays, place_robot=None)
 
     rest, number, bounds, sight, ticks = [], [], [], [], []
+    columns = sight_columns(workspace.features)
     for k, mission in enumerate(missions):
         z = np.swapaxes(mission.awareness, 0, 1).copy()
         z[..., [name == THREAT for name in workspace.features]] = 0.0  # it is to be explained
         along = bounds_along(mission.driven)
         expected = states_along(trust_recursion(plain, z, bounds=along, by_robot=True))[0]
+        of_team = z[..., columns].mean((0, -1)) if columns else np.full(len(along), 0.5)
+
         rate = mission.contact_rate
         known = np.isfinite(rate).any(1)
         rest.append(np.nanmean((rate - expected)[known], axis=1))
         number.append(np.full(known.sum(), k))
         bounds.append(along[known])
-        columns = sight_columns(workspace.features)
-        of_team = z[..., columns].mean((0, -1)) if columns else np.full(len(along), 0.5)
         sight.append(of_team[known])
         ticks.append(np.isfinite(rate).sum(1)[known])
 
     at, of_mission = np.concatenate(bounds), np.concatenate(number)
     g = _scale(posterior, "f_e", np.concatenate(sight))
     noise = _mean(posterior, "delta_v") * _scale(posterior, "f_v", np.concatenate(sight))
+
+    # Effects of places.
     same = (at[:, None] == at).all(-1)
     apart = np.linalg.norm(at[:, None, 1:] - at[:, 1:].astype(float), axis=-1)
     cov = _mean(posterior, "tau_s") ** 2 * matern(apart, _mean(posterior, "length_scale"))
     cov += _mean(posterior, "tau_e") ** 2 * np.outer(g, g) * same
+
+    # Effects of robots, and noise.
     by_mission = of_mission[:, None] == of_mission
     of_robots = sum(_mean(posterior, name) ** 2 for name in ("tau_slow", "tau_mission"))
     cov += of_robots / workspace.team.n_robots * by_mission
@@ -177,6 +182,7 @@ def _log_evidence(
     factor = cho_factor(cov)
     solved = cho_solve(factor, rest)
     precision_before = _EFFECT_SD**-2.0
+
     ratios = []
     for first in range(n_missions):
         x = np.where(number >= first, exposed, 0.0).reshape(-1, n).T
@@ -195,6 +201,7 @@ def _log_sightings(seen: Sequence[Sighting], workspace: Workspace) -> tuple[np.n
     grid = workspace.grid
     x, y = (axis.ravel() for axis in np.meshgrid(grid.x, grid.y))
     area = grid.cell_height * grid.cell_width * x.size
+
     found = np.zeros(x.size)
     for sighting in seen:
         var = sighting.sd**2 + grid.cell_height * grid.cell_width / 12.0
