@@ -469,7 +469,7 @@ class Mission(Summary):
     @cached_property
     def bounds(self) -> tuple[Bound, ...]:
         """Bounds that were run, whose arrays are views of those of the mission."""
-        cells = [cell[:2] for cell in self.driven[1:]] or [NOWHERE] * len(self.contact_rate)
+        cells = cells_of(self.driven[1:]) or [NOWHERE] * len(self.contact_rate)
         columns = (getattr(self, name) for name in _COLUMNS)
 
         return tuple(Bound(*values) for values in zip(cells, *columns, strict=True))
@@ -519,6 +519,11 @@ def require_map(what: str, missions: Iterable[Mission]) -> None:
 def require_path(what: str, value: object) -> tuple[Station, ...]:
     """Return the cells of a path; raises TrustboError if a cell or a set of posts is invalid."""
     return require_cells(what, value, POST_SETS)
+
+
+def cells_of(path: Iterable[Station]) -> list[Cell]:
+    """Return the cells of a path, (row, col), without the sets of posts."""
+    return [station[:2] for station in path]
 
 
 def path_text(path: Iterable[Station]) -> str:

@@ -25,7 +25,7 @@ from trustbo.campaign.settings import (
 from trustbo.campaign.simulated import require_simulator, run_missions, settings_of
 from trustbo.campaign.state import Entry, Exclusion, Failure, State
 from trustbo.campaign.stopping import Stop, require_stop
-from trustbo.data import Cell, Mission
+from trustbo.data import Cell, Mission, cells_of
 from trustbo.display import say
 from trustbo.errors import (
     TrustboError,
@@ -399,7 +399,7 @@ class Campaign(Recorder):
             self.storage.require_open()
             path = self.ask().path if reason in CAUSES or where is not None else ()
             where = None if where is None else require_pair("where", where)
-            entered = tuple(station[:2] for station in path[1:])
+            entered = tuple(cells_of(path[1:]))
             if where is not None and (reason not in CAUSES or where not in entered):
                 raise TrustboError(
                     f"where = {where} must be a cell that the plan enters, {entered}, with one of "

@@ -12,7 +12,7 @@ import numpy as np
 
 from trustbo.campaign.learning import missions_of_hazard
 from trustbo.campaign.state import State
-from trustbo.data import Cell, Mission
+from trustbo.data import Cell, Mission, cells_of
 from trustbo.hazard.trials import CAUSES, UNKNOWN, Trials
 from trustbo.planning import Plan, Planner
 from trustbo.planning.plan import PastFailure
@@ -36,7 +36,7 @@ def with_past_failures(
     risk = planner.problem.risk
     if risk is None:
         return plan
-    cells = [station[:2] for station in plan.path]
+    cells = cells_of(plan.path)
     ends = zip(cells[1:], [*cells[2:], None], strict=True)
     ahead = [(k, *end) for k, end in enumerate(ends, start=1) if k > plan.n_driven]
 
@@ -66,7 +66,7 @@ def _failures(
     """
     goal = tuple(state.settings["goal"])
     for number, mission in missions_of_hazard(state, so_far):
-        cells = [station[:2] for station in mission.path]
+        cells = cells_of(mission.path)
         bounds = zip(pairwise(cells), mission.statuses, strict=False)
         failed = {ends: status for ends, status in bounds if status in CAUSES}
         if failed:

@@ -12,7 +12,7 @@ from trustbo.campaign.choose import choose, informed_planner
 from trustbo.campaign.learning import as_learned, learn_hazard
 from trustbo.campaign.past_failures import with_past_failures
 from trustbo.campaign.result import Result
-from trustbo.data import Cell, Mission, Station, path_text
+from trustbo.data import Cell, Mission, Station, cells_of, path_text
 from trustbo.errors import TrustboError
 from trustbo.hazard.path_risk import PathRisk
 from trustbo.hazard.risk import BoundRisk
@@ -103,7 +103,7 @@ def follow(
 
 def _planned(path: tuple[Station, ...], cell: Cell) -> tuple[Station, ...]:
     """Return the planned path up to a cell."""
-    cells = [station[:2] for station in path]
+    cells = cells_of(path)
     if cells.count(cell) != 1:
         often = "does not enter" if cell not in cells else "enters more than once"
         raise TrustboError(
@@ -117,7 +117,7 @@ def _returned(path: tuple[Station, ...], cell: Cell, so_far: Mission) -> tuple[S
     """Return the path so far, followed by a bound back from the cell that was not reached."""
     # If a mission stops after a bound that was completed, only the mission has another status.
     is_completed = so_far.bounds[-1].status == "ok" and so_far.status not in CAUSES
-    possible = [station[:2] for station in (path[-1:] if is_completed else path[-2:])]
+    possible = cells_of(path[-1:] if is_completed else path[-2:])
     if cell not in possible:
         places = " or ".join(map(str, possible))
         raise TrustboError(f"after the bounds so far, the team is in {places}, not in {cell}.")
@@ -126,7 +126,7 @@ def _returned(path: tuple[Station, ...], cell: Cell, so_far: Mission) -> tuple[S
 
 def failed_bounds(mission: Mission) -> list[Pair]:
     """Return the cells left and entered of each bound that failed."""
-    cells = [station[:2] for station in mission.path]
+    cells = cells_of(mission.path)
     bounds = zip(pairwise(cells), mission.statuses, strict=False)
     return [bound for bound, status in bounds if status in CAUSES]
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Cell, Mission, path_text
+from trustbo.data import Cell, Mission, cells_of, path_text
 from trustbo.errors import TrustboError
 from trustbo.files import read_file
 from trustbo.hazard.trials import LostMission
@@ -56,9 +56,7 @@ class Failure(NamedTuple):
             "reason": self.reason,
             "where": where,
             "failed_bounds": where and f"into {where} ({self.reason})",
-            "n_bounds": np.nan
-            if self.where is None
-            else [station[:2] for station in self.path].index(self.where, 1),
+            "n_bounds": np.nan if self.where is None else cells_of(self.path).index(self.where, 1),
             "path_changed": False,
             "replanned": False,
             "path": path_text(self.path),

@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from trustbo.data import Cell, Mission
+from trustbo.data import Cell, Mission, cells_of
 from trustbo.errors import TrustboError, require_list
 from trustbo.stacking import list_of_missions
 from trustbo.workspace.moves import END, bounds_and_next
@@ -143,7 +143,7 @@ class Trials(NamedTuple):
 
 def _reported(mission: Mission, goal: Cell | None) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds that were completed or failed, (bound, 4), and whether each one failed."""
-    path = [station[:2] for station in mission.path]
+    path = cells_of(mission.path)
     statuses = mission.statuses
 
     fails = np.array([status in CAUSES for status in statuses])
@@ -167,7 +167,7 @@ def _reported(mission: Mission, goal: Cell | None) -> tuple[np.ndarray, np.ndarr
 
 def _located(mission: LostMission) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds of a lost mission up to `where`, and whether each one failed."""
-    cells = [station[:2] for station in mission.path]
+    cells = cells_of(mission.path)
     if mission.where not in cells[1:]:
         raise TrustboError(f"where must be a cell that the path enters; got {mission}.")
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.data import POST_SETS, Mission, Sighting
+from trustbo.data import POST_SETS, Mission, Sighting, cells_of
 from trustbo.errors import TrustboError
 from trustbo.files import FilePath, interpreting, read_file, to_path, write_file
 from trustbo.stacking import require_same_team
@@ -113,7 +113,7 @@ def missions_to_tree(missions: Iterable[Mission]) -> xr.DataTree:
     poses, contacts = zip(*ticks, strict=True)
 
     steps = [station for mission in missions for station in mission.path]
-    cells = [station[:2] for station in steps]
+    cells = cells_of(steps)
     variables: dict[str, Any] = {
         "path": (("step", "axis"), np.reshape(cells, (-1, 2)).astype(int)),
         "start": ("bound", [bound.t0 for bound in bounds], {"units": "s"}),
