@@ -61,7 +61,7 @@ def as_in_0_5(**changes: Any) -> Callable[[Sequence[str]], tb.models.PooledTrust
     """
 
     def model(features: Sequence[str]) -> tb.models.PooledTrust:
-        settings = {"f_e": 0.0, "tau_lasting": 0.0, "f_v": None} | changes
+        settings = {"f_e": 1.0, "tau_lasting": 0.0, "f_v": None} | changes
         priors = replace(tb.models.Priors.from_features(features), f_v=settings["f_v"])
         places = tb.models.PlaceEffect(f_e=settings["f_e"])
         robots = tb.models.RobotEffect(tau_lasting=settings["tau_lasting"])
@@ -74,8 +74,8 @@ _FLOOR = tb.models.Priors.from_features(["line_of_sight"]).f_v
 MODELS: dict[str, Any] = {
     "default": lambda features: tb.models.default_model(),
     "as in 0.5": as_in_0_5(),
-    "scales": as_in_0_5(f_e=2.0, f_v=_FLOOR),
-    "scale of effects": as_in_0_5(f_e=2.0),
+    "scales": as_in_0_5(f_e=0.3, f_v=_FLOOR),
+    "scale of effects": as_in_0_5(f_e=0.3),
     "lasting part": as_in_0_5(tau_lasting=0.3),
 }
 """Models that can be compared for given features, keyed by name."""

@@ -1,22 +1,27 @@
 """Compare the contact that campaigns lose on all worlds, with that of another version or method.
 
     python benchmarks/lost.py --data DIR --csv out/lost.csv
-    python benchmarks/lost.py --data DIR --compare benchmarks/reference/lost_0.5.csv
+    python benchmarks/lost.py --rows out/lost.csv --compare benchmarks/reference/lost_0.5.csv
 
 Unlike benchmarks/worlds.py, this script needs no truths: the contact lost is that which the
 missions measured, in bounds per mission, with bounds that failed or were not reached as fully lost.
-Missions have the same seeds in all methods, and each method starts from the same prior. The column
-`settled` of the rows is the number of missions after which the planned path did not change again.
+Missions have the same seeds in all methods, and each method starts from the same prior. Rows
+contain the contact lost in each mission, the share of missions that arrived, and `settled`, the
+number of missions after which the planned path did not change again.
+
+With `--rows`, no campaign is run, and the tables are those of the rows of earlier runs. With
+`--compare`, the first ten missions are compared with rows of version 0.5, which are means.
 """
 
 import sys
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from baselines import running_mean
+from baselines import line_of_sight, residual_process, running_mean
 from common import Table, arguments, parsed
 from groups import GROUPS, KINDS, grounds_of, interval
 from summary import bootstrap
@@ -27,14 +32,22 @@ import trustbo as tb
 METHODS: dict[str, dict[str, Any]] = {
     "trustbo": {},
     "running mean": {"policy": running_mean.greedy(), "model": tb.models.PooledTrust()},
+    "residual process": {
+        "policy": residual_process.ResidualProcess(),
+        "model": tb.models.PooledTrust(),
+    },
+    "line of sight": {"policy": line_of_sight.LineOfSight(), "model": tb.models.PooledTrust()},
     "2 sets of posts": {"n_posts": 2},
     "3 sets of posts": {"n_posts": 3},
 }
 """Arguments of `trustbo.iterate`, and `n_posts` of the workspace, keyed by method."""
-USUAL = ("trustbo", "running mean")
-"""Methods that are compared if none is given; the first is the one that others are compared to."""
-COURSES = ("sw-ne",)
-MISSIONS = 10
+OURS = "trustbo"
+USUAL = (OURS, "running mean", "residual process", "line of sight")
+"""Methods that are compared if none is given."""
+COURSES = ("sw-ne", "nw-se")
+MISSIONS = 15
+MISSIONS_OF_0_5 = 10
+"""Number of missions of the campaigns whose rows are in lost_0.5.csv."""
 PLANNER = {"max_bounds": "shortest+4"}
 LABELS = ["world", "kind", "course"]
 LEAST = 0.02
@@ -49,10 +62,27 @@ def main() -> None:
     parser.add_argument("--missions", type=int, default=MISSIONS, help=f"default {MISSIONS}")
     parser.add_argument("--course", action="append", help=f"default {', '.join(COURSES)}")
     parser.add_argument("--csv", type=Path, help="CSV file for the rows")
-    parser.add_argument("--compare", type=Path, help="CSV file with rows of another version")
+    parser.add_argument("--rows", type=Path, action="append", help="CSV file with rows")
+    parser.add_argument("--compare", type=Path, help="CSV file with rows of version 0.5")
     parser.add_argument("--part", default="0/1", help="K/N: every Nth world, beginning with K")
     given = parsed(parser)
 
+    if given.rows:
+        rows = pd.concat([pd.read_csv(file) for file in given.rows])
+    else:
+        rows = run(given)
+
+    if given.compare is None:
+        report(summarised(rows, given.missions))
+        settling(rows)
+    else:
+        before = pd.read_csv(given.compare)
+        ours = summarised(rows, MISSIONS_OF_0_5)
+        differences(ours[ours["method"] == OURS], before[before["method"] == OURS])
+
+
+def run(given: Namespace) -> pd.DataFrame:
+    """Run the campaigns that the arguments of the command line ask for; return the rows."""
     first, step = map(int, given.part.split("/"))
     every = [w for w in worlds(given.data).values() if given.data or w.is_packaged]
     chosen = every[:3] if given.quick else every[first::step]
@@ -64,12 +94,7 @@ def main() -> None:
             if given.csv is not None:
                 given.csv.parent.mkdir(parents=True, exist_ok=True)
                 pd.DataFrame(rows).round(5).to_csv(given.csv, index=False)
-
-    table = pd.DataFrame(rows)
-    report(table)
-    if given.compare is not None:
-        before = pd.read_csv(given.compare)
-        differences(table[table["method"] == "trustbo"], before[before["method"] == "trustbo"])
+    return pd.DataFrame(rows)
 
 
 def rows_of(
@@ -93,15 +118,26 @@ def rows_of(
             planner=PLANNER,
             **options,
         )
-        lost = [lost_in(mission) for mission in result.missions]
         labels = {"world": world.name, "kind": world.kind, "course": course, "method": method}
         arrived = np.mean([mission.status == "ok" for mission in result.missions])
         paths = [*(entry.plan.path for entry in result.state.entries), result.plan.path]
         changes = [k for k in range(1, len(paths)) if paths[k] != paths[k - 1]]
-        labels["settled"] = max(changes, default=0)
-        means = {"first": lost[0], "lost": np.mean(lost), "lost_last_4": np.mean(lost[-4:])}
-        rows.append(labels | means | {"arrive": arrived})
+        lost = {lost_after(k): lost_in(mission) for k, mission in enumerate(result.missions)}
+        rows.append(labels | {"settled": max(changes, default=0), "arrive": arrived} | lost)
     return rows
+
+
+def lost_after(n_missions: int) -> str:
+    """Return the name of the column of the contact lost after `n_missions` missions."""
+    return f"lost_{n_missions + 1}"
+
+
+def summarised(rows: pd.DataFrame, n_missions: int) -> pd.DataFrame:
+    """Add columns with the means over the first `n_missions`, the last four, and the first."""
+    lost = rows[[lost_after(k) for k in range(n_missions)]].to_numpy()
+    return rows.assign(
+        first=lost[:, 0], lost=np.nanmean(lost, 1), lost_last_4=np.nanmean(lost[:, -4:], 1)
+    )
 
 
 def lost_in(mission: tb.Mission) -> float:
@@ -160,6 +196,20 @@ def differences(ours: pd.DataFrame, other: pd.DataFrame) -> None:
             ends = pd.Series({what: found[name, what] for what in ("value", "low", "high")})
             texts.append(interval(np.exp(ends) if name.startswith("ratio") else ends, 3))
         table.row(group, len(of_worlds), *texts)
+    print()
+
+
+def settling(rows: pd.DataFrame) -> None:
+    """Print when the planned path of our method stops changing, by group and kind."""
+    ours = rows[rows["method"] == OURS]
+    n_missions = ours["settled"].max()
+    table = Table("worlds", "campaigns", "median", "90 %", f"not after {n_missions - 1}", first=26)
+    for group, kinds in groups().items():
+        settled = ours["settled"][ours["kind"].isin(kinds)]
+        if len(settled):
+            middle, high = settled.quantile([0.5, 0.9])
+            late = (settled >= n_missions).mean()
+            table.row(group, len(settled), f"{middle:.0f}", f"{high:.0f}", f"{late:.0%}")
     print()
 
 

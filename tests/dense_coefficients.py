@@ -306,7 +306,7 @@ def place_prior(effect, observations, theta, bounds, gain):
     n_contrasts = observations.contact_rate.shape[2] - 1
     sight = line_of_sight(observations)
     of_bounds = [sight[(bounds == bound).all(-1)].mean() for bound in places]
-    g = scale_of(np.array(of_bounds), theta.get("f_e", 1.0))
+    g = scale_of(np.array(of_bounds), floor_of(effect, observations))
     distance = np.linalg.norm(cells[:, None] - cells, axis=2)
     h = np.sqrt(3.0) * distance / theta["length_scale"]
     matern = (1.0 + h) * np.exp(-h) + NUGGET * np.eye(len(cells))
@@ -318,6 +318,12 @@ def place_prior(effect, observations, theta, bounds, gain):
             theta["tau_r"] ** 2 * np.diag(np.repeat(g**2, n_contrasts)),
         ),
     ]
+
+
+def floor_of(effect, observations):
+    """Floor of the scale of effects of bounds; without line of sight, the scale is 1."""
+    named = any(name.startswith("line_of_sight") for name in observations.features)
+    return effect.f_e if named else 1.0
 
 
 def robot_prior(effect, observations, theta, bounds, gain):

@@ -55,7 +55,7 @@ def test_the_default_model_has_effects_of_places_where_missions_have_places(miss
     for given, places in (
         (missions, ()),
         ([Mission.from_arrays(jumps, z, y[..., 0])], ()),
-        ([Mission.from_arrays(whole, z, y[..., 0])], (PlaceEffect(f_e=0.0),)),  # no line of sight
+        ([Mission.from_arrays(whole, z, y[..., 0])], (PlaceEffect(),)),  # no line of sight
     ):
         posterior = tb.fit(given, draws=50, latent=False, check=False, progress=False)
         model = model_from_record(json.loads(posterior.attrs["model_record"]))

@@ -231,10 +231,11 @@ def test_the_prior_mean_is_that_of_prior_draws():
 def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
     """Their variances are those of half-normal standard deviations, E tau^2 = scale^2.
 
-    Those of bounds are multiplied by E[f^2 + (1 - f^2) 4 m (1 - m)], with E f^2 = 1/6 for
-    Beta(1, 2). Of the effects on the team, 5 % are half-normal with scale 3 tau instead.
+    Those of bounds are multiplied by f_e^2 + (1 - f_e^2) 4 m (1 - m). Of the effects on the team,
+    5 % are half-normal with scale 3 tau instead.
     """
-    effects = (PlaceEffect(0.2, 0.1, 0.15), RobotEffect(0.3, 0.4, tau_lasting=0.2))
+    places = PlaceEffect(0.2, 0.1, 0.15, f_e=0.4)
+    effects = (places, RobotEffect(0.3, 0.4, tau_lasting=0.2))
     z = np.random.default_rng(1).uniform(size=(3, 8, 4, 5, 2))
     workspace = tb.Workspace.from_awareness(z, features=("traversability", "line_of_sight"))
     draws = sample_prior_ahead(PooledTrust(effects=effects), workspace, 6000, 1).drawn
@@ -243,7 +244,7 @@ def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
     assert draws.place_bound.shape == (6000, 1, 8, 4, 5)
     assert draws.place.var(0).mean() == pytest.approx(0.2**2, rel=0.1)
     m = z[..., 1].mean(0)
-    scale = 1.0 / 6.0 + 5.0 / 6.0 * 4.0 * m * (1.0 - m)
+    scale = 0.4**2 + (1.0 - 0.4**2) * 4.0 * m * (1.0 - m)
     mean = 0.05 * 3.0 * 2.0 / np.pi * 0.1  # E tau is tau's scale times sqrt(2 / pi), like E |n|
     of_team = 0.1**2 * (0.95 * scale + 0.05 * 9.0) - mean**2
     ratio = draws.place_bound[:, 0].var(0) / of_team

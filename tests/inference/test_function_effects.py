@@ -93,7 +93,7 @@ def dense_log_density(target, values):
     rates = effects.observations.contact_rate
     n_missions, n_bounds, n_robots = rates.shape
     theta = {name: np.atleast_1d(values[name]) for name in ("tau_slow", "tau_mission")}
-    others = (*PlaceEffect.names, "f_e", "tau_lasting")
+    others = (*PlaceEffect.names, "tau_lasting")
     theta |= {name: np.atleast_1d(values[name]) for name in others if name in values}
     beta0 = np.broadcast_to(values["beta0"], n_robots)
     theta["inverse_gain"] = np.atleast_1d(1.0 - values["beta0"])

@@ -24,7 +24,7 @@ def workspace():
     return tb.Workspace.from_awareness(z, features=("line_of_sight",))
 
 
-def drawn(workspace, **parameters):
+def drawn(workspace, f_e=1.0):
     """Return effects (draw, move, row, col), of which those in one bound are 0.7."""
     places = visited(np.array([[VISITED]]), SHAPE)
     draws = {
@@ -32,8 +32,8 @@ def drawn(workspace, **parameters):
         "place_bound": np.full((1, N_DRAWS, 1), 0.7),
         "place_robot": np.zeros((1, N_DRAWS, 1, 2)),
     }
-    group = place_group(draws, places, ["r1", "r2"], seed=5)
-    values = {"tau_s": 0.0, "length_scale": 2.0, "tau_e": TAU, **parameters}
+    group = place_group(draws, places, ["r1", "r2"], f_e=f_e, seed=5)
+    values = {"tau_s": 0.0, "length_scale": 2.0, "tau_e": TAU}
     values = {name: np.full(N_DRAWS, value) for name, value in values.items()}
     return place_maps_of(group, values, workspace)["place_bound"][:, 0]
 
@@ -50,9 +50,9 @@ def test_a_driven_bound_teaches_the_other_sets_of_posts_of_the_same_bound():
         "place_bound": known,
         "place_robot": np.zeros((1, N_DRAWS, 2, 2)),
     }
-    values = {"tau_s": 0.0, "length_scale": 2.0, "tau_e": TAU, "f_e": FLOOR}
+    values = {"tau_s": 0.0, "length_scale": 2.0, "tau_e": TAU}
     values = {name: np.full(N_DRAWS, value) for name, value in values.items()}
-    group = place_group(draws, places, ["r1", "r2"], seed=5)
+    group = place_group(draws, places, ["r1", "r2"], f_e=FLOOR, seed=5)
     e = place_maps_of(group, values, space)["place_bound"][:, 0]
     np.testing.assert_array_equal(e[:, [5, 13], 1, 1], known[0])
 

@@ -3,7 +3,6 @@
 import json
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 import pytest
 from missions import walking_missions
@@ -11,8 +10,6 @@ from missions import walking_missions
 from trustbo.data import Mission
 from trustbo.inference.fit import fit
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, PooledTrust, RobotEffect
-from trustbo.models.backend import own_settings
-from trustbo.models.effects.place import _prior_of_floor
 from trustbo.models.record import effects_from_record, model_to_record
 
 N_MISSIONS = 4
@@ -199,12 +196,3 @@ def test_an_effect_with_nested_settings_is_rebuilt_as_it_was():
     model = PooledTrust(effects=[Payload(kg=((1.0, 2.0), (3.0, 4.0)))])
     record = json.loads(json.dumps(model_to_record(model)))
     assert {*effects_from_record(record)} == {*model.effects}  # effects are keys of dicts
-
-
-def test_a_prior_that_is_first_made_in_a_traced_function_can_be_used_outside():
-    """NumPyro functions make effects while JAX traces them, and the prior is made only once."""
-    _prior_of_floor.cache_clear()
-    with own_settings():
-        jax.jit(lambda x: x + PlaceEffect().hyperpriors()["f_e"].log_prob(x))(0.5)
-        density = PlaceEffect().hyperpriors()["f_e"].log_prob(0.75)  # of Beta(1, 2)
-    assert float(density) == pytest.approx(np.log(2.0 * (1.0 - 0.75)), rel=1e-6)

@@ -23,8 +23,7 @@ def effects():
         known=known,
         column=column,
         tau_r=rng.uniform(0.1, 0.2, N_DRAWS),
-        floor=rng.uniform(0.1, 0.9, N_DRAWS),
-        variation=rng.uniform(size=SHAPE),
+        scale=rng.uniform(0.1, 1.0, size=SHAPE),
         number=np.arange(N_DRAWS),
         seed=3,
     )
@@ -40,8 +39,7 @@ def test_other_bounds_have_contrasts_of_independent_normals(effects):
     np.testing.assert_allclose(every.sum(1), 0.0, atol=1e-12)
 
     # A contrast of n independent normals with standard deviation g tau_r is a normal with it.
-    tau_r, floor = (x[:, None, None, None] for x in (effects.tau_r, effects.floor))
-    sd = tau_r * np.sqrt(floor**2 + (1.0 - floor**2) * effects.variation)
+    sd = effects.tau_r[:, None, None, None] * effects.scale
     contrast = (every[:, 0] - every[:, 1]) / np.sqrt(2.0) / sd
     other = contrast[:, effects.column < 0]
     assert stats.kstest(other.ravel(), "norm").pvalue > 0.001

@@ -594,14 +594,14 @@ def with_prior_effects_ahead(
     robots = workspace.team.names
     n_draws = len(theta["inverse_gain"])
     group = None
-    if any(isinstance(effect, PlaceEffect) for effect in effects):
+    for effect in (e for e in effects if isinstance(e, PlaceEffect)):
         nowhere = {
             "place": np.zeros((1, n_draws, 0)),
             "place_bound": np.zeros((1, n_draws, 0)),
             "place_robot": np.zeros((1, n_draws, 0, len(robots))),
         }
         places = visited(np.full((1, 1, 3), -1), workspace.grid.shape)
-        group = place_group(nowhere, places, robots, seed)
+        group = place_group(nowhere, places, robots, f_e=effect.f_e, seed=seed)
 
     never = {"robot_effect": np.zeros((n_draws, 0, len(robots)))}
     values = dict.fromkeys(_effects_of_robots(effects), never)

@@ -52,7 +52,12 @@ _BOUND = ("move", "row", "col")
 
 
 def place_group(
-    draws: Mapping[str, np.ndarray], places: Visited, robots: Sequence[str], seed: int
+    draws: Mapping[str, np.ndarray],
+    places: Visited,
+    robots: Sequence[str],
+    *,
+    f_e: float,
+    seed: int,
 ) -> xr.Dataset:
     """Build the posterior group `places`, with the effects of visited cells and bounds.
 
@@ -62,6 +67,7 @@ def place_group(
         places: Visited places. If some are not on the map of the workspace, the coordinates
             `cell_map` and `bound_map` contain the numbers of the maps, 0 for the workspace.
         robots: Names of the robots.
+        f_e: Floor of the scale of effects in bounds; see `PlaceEffect`.
         seed: Random seed for the maps that `params_of` draws.
     """
     variables = {
@@ -81,7 +87,8 @@ def place_group(
     if places.bound_map.any():
         coords["cell_map"] = "cell", places.cell_map
         coords["bound_map"] = "bound", places.bound_map
-    return xr.Dataset(variables, coords, {"shape": list(places.shape), "seed": seed})
+    attrs = {"shape": list(places.shape), "f_e": f_e, "seed": seed}
+    return xr.Dataset(variables, coords, attrs)
 
 
 def place_maps_of(
@@ -111,12 +118,15 @@ def place_maps_of(
     # Effects of different bounds are independent, so only those of visited bounds change.
     sight = _sight(group, workspace)
     visited = _bounds(group)
-    place_bound = _of_bounds(parameters, sight, visited, np.random.default_rng([seed, 1]))
+    tau_e = parameters["tau_e"][:, None, None, None]
+    rng = np.random.default_rng([seed, 1])
+    place_bound = _of_bounds(tau_e, group.attrs["f_e"], sight, visited, rng)
     _centre(place_bound)
 
     e = joined_draws(group["place_bound"], ["bound"])
     if len(sight) > len(MOVE_NAMES):
-        _learn_from_other_posts(place_bound, visited, e, parameters, sight)
+        sd = np.maximum(scale_at(variation(sight), group.attrs["f_e"]) * tau_e, LEAST)
+        _learn_from_other_posts(place_bound, visited, e, sd)
     place_bound[:, *visited] = e
     return {"place": place[:, None], "place_bound": place_bound[:, None]}
 
@@ -152,16 +162,10 @@ def robots_in_bounds_of(
         known=known,
         column=column,
         tau_r=tau_r,
-        floor=_floor(parameters),
-        variation=variation(sight),
+        scale=scale_at(variation(sight), group.attrs["f_e"]),
         number=np.arange(len(tau_r)),
         seed=seed,
     )
-
-
-def _floor(parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the floor (draw,) of the scale of effects in bounds, which is 1 in some models."""
-    return parameters.get("f_e", np.ones(len(parameters["tau_e"])))
 
 
 def _sight(group: xr.Dataset, workspace: Workspace | None) -> np.ndarray:
@@ -185,28 +189,28 @@ def _sight(group: xr.Dataset, workspace: Workspace | None) -> np.ndarray:
 
 
 def _of_bounds(
-    parameters: Mapping[str, np.ndarray],
+    tau_e: np.ndarray,
+    f_e: float,
     sight: np.ndarray,
     visited: tuple[np.ndarray, ...],
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Draw effects e (draw, way, row, col) of unvisited bounds, given the mean line of sight.
 
-    They are normal with standard deviation g tau_e for the scale g. A small share of them, for
-    which the map is wrong, are half-normal with scale 3 tau_e, and positive if the line of sight is
-    below 0.5, otherwise negative. In models without the scale, all are normal, and so are all in
-    bounds that were `visited` with any set of posts.
+    They are normal with standard deviation g tau_e for the scale g; tau_e has one value for each
+    draw. A small share of them, for which the map is wrong, are half-normal with scale 3 tau_e, and
+    positive if the line of sight is below 0.5, otherwise negative. If f_e is 1, all are normal, and
+    so are all in bounds that were `visited` with any set of posts.
     """
-    tau_e, floor = (x[:, None, None, None] for x in (parameters["tau_e"], _floor(parameters)))
     e = rng.standard_normal((len(tau_e), *sight.shape))
     n_posts = len(sight) // len(MOVE_NAMES)
     if n_posts > 1:
         of_all = rng.standard_normal((len(tau_e), len(MOVE_NAMES), *sight.shape[1:]))
         e *= np.sqrt(1.0 - BETWEEN_POSTS)
         e += np.sqrt(BETWEEN_POSTS) * np.tile(of_all, (1, n_posts, 1, 1))
-    scale = scale_at(variation(sight), floor)
+    scale = scale_at(variation(sight), f_e)
 
-    if "f_e" in parameters:
+    if f_e < 1.0:
         to_middle = 0.5 - sight  # 0 where line of sight is not predicted
         ways, rows, cols = visited
         is_known = np.zeros((len(MOVE_NAMES), *sight.shape[1:]), bool)
@@ -214,7 +218,7 @@ def _of_bounds(
         share = np.where(to_middle == 0.0, 0.0, _SHARE_WRONG)
         share[np.tile(is_known, (n_posts, 1, 1))] = 0.0
         is_wrong = rng.random(e.shape, dtype=np.float32) < share
-        scale[is_wrong] = _SD_WRONG
+        scale = np.where(is_wrong, _SD_WRONG, scale)
         np.copysign(e, to_middle, out=e, where=is_wrong)
 
     e *= scale
@@ -226,18 +230,15 @@ def _learn_from_other_posts(
     free: np.ndarray,
     visited: tuple[np.ndarray, ...],
     e: np.ndarray,
-    parameters: Mapping[str, np.ndarray],
-    sight: np.ndarray,
+    sd: np.ndarray,
 ) -> None:
     """Add, in place, what visited sets of posts teach about the other sets of their bounds.
 
     By Matheron's rule, the draws `free` (draw, way, row, col) of unvisited ways get the kriged
     difference of the posterior draws `e` (draw, visited) from the free draws of visited ways.
     """
-    sd = scale_at(variation(sight), _floor(parameters)[:, None, None, None])
-    sd = np.maximum(sd * parameters["tau_e"][:, None, None, None], LEAST)
-
-    shape = len(MOVE_NAMES), *sight.shape[1:]
+    _, n_ways, *grid = sd.shape
+    shape = len(MOVE_NAMES), *grid
     more = np.zeros((len(e), *shape))
     n_visited = np.zeros(shape)
     for k, (way, row, col) in enumerate(zip(*visited, strict=True)):
@@ -246,7 +247,7 @@ def _learn_from_other_posts(
         n_visited[bound] += 1.0
 
     more *= BETWEEN_POSTS / (1.0 + (n_visited - 1.0) * BETWEEN_POSTS)
-    free += sd * np.tile(more, (1, len(sight) // len(MOVE_NAMES), 1, 1))
+    free += sd * np.tile(more, (1, n_ways // len(MOVE_NAMES), 1, 1))
 
 
 def in_order_of_places(group: xr.Dataset) -> xr.Dataset:

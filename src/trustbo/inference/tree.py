@@ -104,7 +104,8 @@ def to_tree(found: Fitted, missions: Sequence[Mission], seed: int) -> xr.DataTre
         if isinstance(effect, PlaceEffect):  # has its own axes
             at: Any = found.observations.visited
             chained = by_chain(own, n_chains)
-            groups[effect.group] = place_group(chained, at, missions[0].robots, seed)
+            robots = missions[0].robots
+            groups[effect.group] = place_group(chained, at, robots, f_e=effect.f_e, seed=seed)
         else:
             named = _draws(own, n_chains, effect.variables)
             groups[effect.group] = _dataset(named, {**coords, **effect.coords})

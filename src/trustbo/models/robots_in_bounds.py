@@ -5,8 +5,6 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.special import ndtri
 
-from trustbo.models.sight_scale import scale_at
-
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _MIX = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
 _ONE = 2.0**-53  # spacing of the uniform numbers
@@ -25,9 +23,7 @@ class RobotsInBounds(NamedTuple):
         known: Effects in visited bounds, shape (draw, robot, visited).
         column: Index of the visited bound in `known`, shape (move, row, col); -1 elsewhere.
         tau_r: Standard deviation at the scale 1, shape (draw,).
-        floor: Floor of the scale, shape (draw,).
-        variation: `sight_scale.variation` of the mean line of sight in each bound, shape (move,
-            row, col).
+        scale: Scale g in each bound, shape (move, row, col).
         number: Number of each draw, shape (draw,), which does not change when draws are selected.
         seed: Random seed.
     """
@@ -35,8 +31,7 @@ class RobotsInBounds(NamedTuple):
     known: np.ndarray
     column: np.ndarray
     tau_r: np.ndarray
-    floor: np.ndarray
-    variation: np.ndarray
+    scale: np.ndarray
     number: np.ndarray
     seed: int
 
@@ -61,7 +56,7 @@ class RobotsInBounds(NamedTuple):
         robot = np.arange(n_robots)[:, None] * self.column.size
         draw = self.number[:, None, None] * n_robots * self.column.size
         n = _standard_normal(draw + robot + bound, self.seed)
-        g = scale_at(self.variation.ravel()[bound], self.floor[:, None, None])
+        g = self.scale.ravel()[bound]
         return g * self.tau_r[:, None, None] * (n - n.mean(-2, keepdims=True))
 
     def everywhere(self) -> np.ndarray:
@@ -75,16 +70,13 @@ class RobotsInBounds(NamedTuple):
         return self._replace(
             known=self.known[index],
             tau_r=self.tau_r[index],
-            floor=self.floor[index],
             number=self.number[index],
         )
 
     def mean(self) -> Self:
         """Average over draws; effects are 0 in bounds that were not visited."""
         known = self.known.mean(0, keepdims=True)
-        return self._replace(
-            known=known, tau_r=np.zeros(1), floor=np.ones(1), number=np.zeros(1, int)
-        )
+        return self._replace(known=known, tau_r=np.zeros(1), number=np.zeros(1, int))
 
 
 def _standard_normal(counter: np.ndarray, seed: int) -> np.ndarray:

@@ -25,7 +25,7 @@ from trustbo.data import THREAT, Mission, Sighting, require_map, sight_columns
 from trustbo.errors import TrustboError, require_kind, require_share
 from trustbo.inference.learner import params_of
 from trustbo.models.draws import PLACES
-from trustbo.models.effects.place import matern
+from trustbo.models.effects.place import PlaceEffect, matern
 from trustbo.models.sight_scale import scale_at, variation
 from trustbo.planning.recursion import states_along, trust_recursion
 from trustbo.stacking import list_of_missions
@@ -136,14 +136,18 @@ def _residuals(
         ticks.append(np.isfinite(rate).sum(1)[known])
 
     at, of_mission = np.concatenate(bounds), np.concatenate(number)
-    g = _scale(posterior, "f_e", np.concatenate(sight))
-    noise = _mean(posterior, "delta_v") * _scale(posterior, "f_v", np.concatenate(sight))
+    changes = variation(np.concatenate(sight))
+    noise = _mean(posterior, "delta_v")
+    if "f_v" in posterior["posterior"]:
+        noise = noise * scale_at(changes, _mean(posterior, "f_v"))
 
     # Effects of places.
     same = (at[:, None] == at).all(-1)
     apart = np.linalg.norm(at[:, None, 1:] - at[:, 1:].astype(float), axis=-1)
     cov = _mean(posterior, "tau_s") ** 2 * matern(apart, _mean(posterior, "length_scale"))
-    cov += _mean(posterior, "tau_e") ** 2 * np.outer(g, g) * same
+    if PlaceEffect.group in posterior:
+        g = scale_at(changes, posterior[PlaceEffect.group].attrs["f_e"])
+        cov += _mean(posterior, "tau_e") ** 2 * np.outer(g, g) * same
 
     # Effects of robots, and noise.
     by_mission = of_mission[:, None] == of_mission
@@ -157,13 +161,6 @@ def _mean(posterior: xr.DataTree, name: str) -> float:
     """Return the posterior mean of a hyperparameter; 0 if the model has none of that name."""
     group = posterior["posterior"].to_dataset()
     return float(group[name].mean()) if name in group else 0.0
-
-
-def _scale(posterior: xr.DataTree, floor: str, sight: np.ndarray) -> np.ndarray:
-    """Return the scale of effects or noise by the mean line of sight (bound,)."""
-    if floor not in posterior["posterior"]:
-        return np.ones(len(sight))
-    return scale_at(variation(sight), _mean(posterior, floor))
 
 
 def _log_evidence(

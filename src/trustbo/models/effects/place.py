@@ -1,11 +1,9 @@
 """Place effects: a process s over cells, and effects e of bounds and r of robots in bounds."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any, ClassVar, Self
 
-import jax
 import numpy as np
 import numpyro.distributions as dist
 from numpy.typing import ArrayLike
@@ -13,8 +11,7 @@ from scipy import sparse
 from scipy.linalg import helmert, lapack
 
 from trustbo.data import Mission, sight_columns
-from trustbo.errors import require_positive
-from trustbo.models.backend import own_settings
+from trustbo.errors import require_positive, require_share
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
@@ -48,11 +45,11 @@ class PlaceEffect(Effect):
         g^2 = f_e^2 + (1 - f_e^2) 4 m (1 - m)
 
     The floor f_e is g where m is 0 or 1. Without a feature that predicts line of sight, and if
-    trust is a logit, f_e is 1, so that all bounds have the same scale.
+    trust is a logit, all bounds have the same scale, 1.
 
-    The map is simply wrong about a few bounds. If f_e is not fixed, 5 % of the draws of e in a
-    bound that was never driven are therefore half-normal with scale 3 tau_e, and move trust towards
-    0.5. The draws are shifted so that their mean remains 0. Fits and planned paths do not change.
+    The map is simply wrong about a few bounds. If f_e is below 1, 5 % of the draws of e in a bound
+    that was never driven are therefore half-normal with scale 3 tau_e, and move trust towards 0.5.
+    The draws are shifted so that their mean remains 0. Fits and planned paths do not change.
 
     A bound has an effect e, and effects r, for each set of posts from which T2 watches it. The
     effects e of different sets have the correlation `BETWEEN_POSTS`; effects r are independent.
@@ -71,11 +68,10 @@ class PlaceEffect(Effect):
         tau_r: Scale of the half-normal prior on the standard deviation of r.
         length_scale: Median of the log-normal prior on the length scale of s, in cells.
         length_scale_sd: Prior standard deviation of the log length scale.
-        f_e: Number b of the prior Beta(1, b) on the floor f_e, whose mean is 1 / (1 + b). With 0,
-            the floor is 1.
+        f_e: Floor f_e of the scale, from 0 to 1. With 1, all bounds have the same scale.
 
     Raises:
-        TrustboError: If a setting is not positive, or `f_e` is negative.
+        TrustboError: If a setting is not positive, or `f_e` is not from 0 to 1.
 
     Example:
         >>> model = tb.models.PooledTrust(effects=[tb.models.PlaceEffect(tau_s=0.4)])
@@ -88,7 +84,7 @@ class PlaceEffect(Effect):
     tau_r: float = 0.1
     length_scale: float = 2.0
     length_scale_sd: float = 0.5
-    f_e: float = 2.0
+    f_e: float = 0.3
     names = ("tau_s", "length_scale", "tau_e", "tau_r")
     group = "places"
     # The axes are defined in `place_maps.place_group`.
@@ -98,22 +94,16 @@ class PlaceEffect(Effect):
         super().__post_init__()
         sd = require_positive("PlaceEffect.length_scale_sd", self.length_scale_sd)
         object.__setattr__(self, "length_scale_sd", sd)
-        f_e = require_positive("PlaceEffect.f_e", self.f_e, or_zero=True)
-        object.__setattr__(self, "f_e", f_e)
+        object.__setattr__(self, "f_e", require_share("PlaceEffect.f_e", self.f_e))
 
     def for_features(self, features: Sequence[str], *, of_rates: bool) -> Self:
-        """See `Effect.for_features`; the floor is 1 where nothing predicts the rate."""
-        if of_rates and sight_columns(features):
-            return self
-        return replace(self, f_e=0.0)
+        """See `Effect.for_features`; the floor is 1 if trust is a logit."""
+        return self if of_rates else replace(self, f_e=1.0)
 
     def hyperpriors(self) -> dict[str, dist.Distribution]:
         """See `Effect.hyperpriors`."""
         length_scale = dist.LogNormal(np.log(self.length_scale), self.length_scale_sd)
-        priors = super().hyperpriors() | {"length_scale": length_scale}
-        if self.f_e > 0.0:
-            priors["f_e"] = _prior_of_floor(self.f_e)
-        return priors
+        return super().hyperpriors() | {"length_scale": length_scale}
 
     @property
     def pairs(self) -> list[Pair]:
@@ -157,11 +147,10 @@ class PlaceEffect(Effect):
         """Return a Gaussian-process prior on cells and independent priors on bounds."""
         xp: Any = namespace(theta["tau_e"])
         places: Any = observations.visited
-        g = scale_of_bounds(theta, _variation(observations))  # (point or 1, bound)
-        ones = np.ones((len(theta["tau_e"]), len(places.bounds)))
-        sd = ones * xp.maximum(g * theta["tau_e"][:, None], LEAST)
+        g = scale_at(_variation(observations), self.f_e)
+        sd = xp.maximum(g * theta["tau_e"][:, None], LEAST)
         of_bounds = _precision_of_bounds(sd, _same_bound(places))
-        of_robot = ones * xp.maximum(g * theta["tau_r"][:, None], LEAST) ** -2.0
+        of_robot = xp.maximum(g * theta["tau_r"][:, None], LEAST) ** -2.0
         of_robots = xp.repeat(of_robot, observations.n_robots - 1, axis=1)
 
         of_cells = [self._cells(theta, square) for square in places.squares]
@@ -195,26 +184,6 @@ class PlaceEffect(Effect):
         return np.column_stack([values["place"], values["place_bound"], of_robots])
 
 
-@cache
-def _prior_of_floor(b: float) -> dist.Distribution:
-    """Return Beta(1, b); it takes JAX some time to make it.
-
-    It is the same within a NumPyro function that JAX traces, whose values must not leave it.
-    """
-    with own_settings(), jax.ensure_compile_time_eval():
-        return dist.Beta(1.0, b)
-
-
-def scale_of_bounds(theta: Mapping[str, Any], of_bound: np.ndarray) -> Any:
-    """Return the scale (point, bound), or (1, bound) of ones, of the effects of bounds.
-
-    `of_bound` (bound,) is `variation` of the mean line of sight of the robots in each bound.
-    """
-    if "f_e" not in theta:
-        return np.ones((1, len(of_bound)))
-    return scale_at(of_bound, theta["f_e"][:, None])
-
-
 def _same_bound(places: Visited) -> np.ndarray:
     """Return whether visited ways are those of the same bound, shape (bound, bound)."""
     bounds = np.column_stack([places.bound_map, places.bounds])
@@ -239,8 +208,14 @@ def _precision_of_bounds(sd: Any, same: np.ndarray) -> Any:
 
 
 def _variation(observations: Observations) -> np.ndarray:
-    """Return `variation` of the mean line of sight in each visited bound, shape (bound,)."""
+    """Return `variation` of the mean line of sight in each visited bound, shape (bound,).
+
+    It is 1, where the scale is 1, if line of sight is not predicted.
+    """
     places: Any = observations.visited
+    if not sight_columns(observations.features):
+        return np.ones(len(places.bounds))
+
     there = places.at >= 0
     at = places.at[there]
     sight = observations.line_of_sight.mean(-1)[there]
