@@ -15,7 +15,7 @@ import trustbo as tb
 from trustbo.campaign.folder import MemoryStorage
 from trustbo.inference import params_of
 from trustbo.planning import Planner
-from trustbo.planning.draws import choose_draws
+from trustbo.planning.drawn_paths import choose_draws
 
 ENDS = ((3, 0), (0, 3))
 QUIET = {"sampler": "importance", "progress": False}

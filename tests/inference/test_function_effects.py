@@ -148,7 +148,7 @@ def test_the_density_is_that_of_one_large_normal(function, missions):
 
     n_missions, n_bounds, n_robots = target.effects.observations.contact_rate.shape
     resolution = target.effects.observations.resolution
-    _, inputs = model.over_draws("form", 2, target.data)(prior, keys)
+    _, inputs = model.over_draws("space_and_inputs", 2, target.data)(prior, keys)
     for one in range(2):
         values = {name: v[one] for name, v in prior.items()}
         values["delta_v"] = np.hypot(values["delta_v"], resolution)

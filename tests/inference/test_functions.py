@@ -786,6 +786,21 @@ def test_a_drift_may_depend_on_the_duration(missions):
     assert fitted.attrs["k_hat"] < 0.7
 
 
+@pytest.mark.parametrize("of", ["drift", "noise"])
+def test_what_depends_on_the_duration_cannot_plan(of, workspace):
+    """The duration of a mission is not known before it."""
+
+    def model(awareness, contact_rate=None, duration=None):
+        a = numpyro.sample("a", dist.Normal(0.0, 1.0))
+        drift = a * awareness[..., 0] * (duration / 60.0 if of == "drift" else 1.0)
+        scale = jnp.sqrt(duration / 60.0) if of == "noise" else jnp.ones(duration.shape)
+        rates = ContactRate(drift, 0.4, 0.05, 0.05, noise_scale=scale)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+    with pytest.raises(tb.TrustboError, match="not finite"):
+        tb.iterate(workspace, (0, 0), (0, 2), model=model, n_iterations=1, progress=False)
+
+
 def test_a_path_may_jump_if_the_function_reads_no_moves(missions):
     cells = [missions[0].path[0], (2, 2), (0, 4)]
     z = missions[0].awareness[:2]

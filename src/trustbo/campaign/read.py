@@ -142,7 +142,7 @@ def load_result(
 
     Example:
         >>> result = tb.load_result("hills")
-        >>> result.table
+        >>> result.table()
     """
     state, workspace, _ = read_campaign(directory)
     if not state.entries:

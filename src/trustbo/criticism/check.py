@@ -11,7 +11,7 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError
-from trustbo.inference.draws import (
+from trustbo.inference.params import (
     is_of_people,
     joined_draws,
     missions_of,

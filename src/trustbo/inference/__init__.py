@@ -5,11 +5,11 @@ from trustbo.models import backend as backend  # imported first because it loads
 # isort: split
 from trustbo.inference.by_rate import by_rate
 from trustbo.inference.compare import compare
-from trustbo.inference.draws import sample_prior
 from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.learner import add_latent, params_of
 from trustbo.inference.loo import loo
+from trustbo.inference.params import sample_prior
 from trustbo.inference.reports import predict_reports
 from trustbo.inference.score import score
 

@@ -14,7 +14,6 @@ from trustbo.data import Mission
 from trustbo.display import slow_bar
 from trustbo.inference import ep
 from trustbo.inference.density import Coefficients, Density, JointDraws, at
-from trustbo.inference.draws import parameters_of, stored_draws
 from trustbo.inference.engine import inputs
 from trustbo.inference.importance import MAX_KHAT, Points, Student, sample
 from trustbo.inference.latent import (
@@ -28,6 +27,7 @@ from trustbo.inference.latent import (
 )
 from trustbo.inference.nuts import sample_by_nuts
 from trustbo.inference.options import Options
+from trustbo.inference.params import parameters_of, stored_draws
 from trustbo.inference.tree import Fitted, by_chain, default_draws
 from trustbo.inference.variables import prior_parameters, to_variables, with_prior_effects
 from trustbo.models.model import TrustModel
@@ -176,7 +176,7 @@ def _draws(
     coefficients = Coefficients.joined(visited)
     proposal = points.proposal.text
 
-    if density.exact:
+    if density.is_gaussian:
         chosen = points.resample(n, rng)
         c = coefficients.draw(chosen, rng)
     else:
@@ -241,7 +241,7 @@ class OfClass(Source):
     @property
     def first_equal(self) -> np.ndarray:
         """See `Source.first_equal`; draws of EP are resampled together with their coefficients."""
-        if self.density.exact:
+        if self.density.is_gaussian:
             return super().first_equal
 
         theta = [values.reshape(self.n_draws, -1) for values in self.draws.theta.values()]
@@ -264,7 +264,7 @@ class OfClass(Source):
         self, given: Given, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
         """See `Source.draw`; unless rates are Gaussian, draws are weighted particles."""
-        draw = draw_exactly if self.density.exact else _draw_particles
+        draw = draw_exactly if self.density.is_gaussian else _draw_particles
         x, log_p = draw(self, given, rng)
         if self.of_counts:
             log_p = log_p + self.shift

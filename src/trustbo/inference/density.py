@@ -13,7 +13,7 @@ from trustbo.inference.importance import Student, climb
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
-from trustbo.statespace.blocks import LinearPredictor, each
+from trustbo.statespace.blocks import LinearPredictor, rate_precision
 
 _CHUNK = 32
 """Largest number of points evaluated at once."""
@@ -138,7 +138,7 @@ class Density:
 
         self.columns = Columns(model.terms, observations)
         self.prior = self.columns.prior
-        self.exact = model.likelihood.gaussian
+        self.is_gaussian = model.likelihood.gaussian
 
         # Which columns depend on each other a priori, and which blocks have equal noise, does not
         # depend on theta, so any will do.
@@ -146,9 +146,9 @@ class Density:
         predictor, prior = self._at(self.theta(np.zeros((1, self.n_scores))))
         U = self.layout.design(self.columns.U)
         self.blocks = Blocks.from_rows(
-            y, U, self.layout.label, predictor.noise_sd[0], prior=prior, apart=not self.exact
+            y, U, self.layout.label, predictor.noise_sd[0], prior=prior, apart=not self.is_gaussian
         )
-        if not self.exact:
+        if not self.is_gaussian:
             self.rates = ep.Rates(model.likelihood, y, self.layout.rows(observations.n_ticks))
             self.reset_ep()
 
@@ -160,7 +160,7 @@ class Density:
     def without(self, mission: int) -> "Density":
         """Return the density without the data of one mission."""
         other = Density(self.model, self.observations.without([mission]))
-        if not self.exact:
+        if not self.is_gaussian:
             kept = ~np.isnan(other.rates.y)
             other.sites = ep.Sites(*(np.where(kept, site, 0.0) for site in self.sites))
         return other
@@ -219,7 +219,7 @@ class Density:
         """Compute log p(rates | theta) at each point, with EP if rates are not Gaussian."""
         log_p = np.empty(len(theta["inverse_gain"]))
         for where, chunk in chunks(theta, self._n_at_once):
-            if self.exact:
+            if self.is_gaussian:
                 fit, _ = self._fit(chunk)
                 log_p[where] = fit.log_p
             else:
@@ -230,12 +230,12 @@ class Density:
 
     def reset_ep(self) -> None:
         """Forget the EP sites, so that results do not depend on earlier computations."""
-        if not self.exact:
+        if not self.is_gaussian:
             self.sites = ep.first_sites(self.rates)
 
     def run_ep(self, theta: Theta) -> None:
         """Find the EP sites at the mean of theta, which determine those at other points."""
-        if not self.exact:
+        if not self.is_gaussian:
             center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
             joint = self._joint(center)
             for _ in range(_SETTLED):
@@ -258,7 +258,7 @@ class Density:
         else:
             best = self._best_of_four_starts()
 
-        if not self.exact:
+        if not self.is_gaussian:
             # The approximate density is most accurate near the theta of `run_ep`.
             self.run_ep(self.theta(best[None]))
             best = climb(self.log_density, best)
@@ -322,7 +322,7 @@ class Density:
 
     def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
         """Compute the evidence at each theta, as in `log_density`; also return the prior."""
-        if not self.exact:
+        if not self.is_gaussian:
             joint = self._joint(theta)
             return ep.nearby(joint, self.near), joint.prior
 
@@ -345,7 +345,7 @@ class Density:
         Here, the noise of a measured rate enters: its sd is `delta_v`, to which `TrustModel.theta`
         adds the resolution of the rate, times `TrustModel.noise_scale`.
         """
-        return self.blocks.seen / each(predictor.noise_sd, self.blocks.first) ** 2
+        return rate_precision(self.blocks.seen, predictor.noise_sd, self.blocks.first)
 
     def _joint(self, theta: Theta) -> ep.Joint:
         """Return the blocks, linear predictors, prior and observations for EP at each theta."""

@@ -15,9 +15,9 @@ from trustbo.errors import (
     require_count,
     require_whole,
 )
-from trustbo.inference.draws import as_fitted, names_in
 from trustbo.inference.learner import as_learner
 from trustbo.inference.options import Options
+from trustbo.inference.params import as_fitted, names_in
 from trustbo.inference.tree import to_tree, with_latent
 from trustbo.models.default import default_model
 from trustbo.models.model import TrustModel

@@ -11,7 +11,7 @@ from trustbo.inference.engine import kinds_of, whiten
 from trustbo.inference.factor import cholesky
 from trustbo.models.families import Family
 from trustbo.models.observations import Observations
-from trustbo.statespace.blocks import Layout, LinearPredictor, each
+from trustbo.statespace.blocks import Layout, LinearPredictor, each, rate_precision
 
 N_PRIOR = 500
 """Number of draws in the group `prior`."""
@@ -157,7 +157,7 @@ def draw_exactly(
     kind, first, seen = kinds_of(y, source.label, predictor.noise_sd[0])
     label = source.label[first]
     S = each(predictor.trust_cov, label)
-    W, log_sites = whiten(label, predictor, seen / each(predictor.noise_sd, first) ** 2)
+    W, log_sites = whiten(label, predictor, rate_precision(seen, predictor.noise_sd, first))
     off = np.where(np.isnan(y), 0.0, y) - given.mean
     w = (W[:, kind] @ off[..., None])[..., 0]
 

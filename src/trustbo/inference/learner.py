@@ -1,7 +1,13 @@
 """Models as campaigns use them: fitting to missions, and draws for planning.
 
-A model is a `TrustModel` or a NumPyro function. Both are converted to a `Learner`, so only this
-module distinguishes them.
+A model is a `TrustModel` or a NumPyro function. Both are converted to a `Learner`, which campaigns
+and planners use without distinguishing them. How a model is sampled is decided in three steps:
+
+1. `as_learner` makes a `Learner` for a class, or a `FunctionLearner` for a function.
+2. Classes: `classes.fit_class` uses importance sampling (`importance.py`), or NUTS (`nuts.py`) on
+   request. With Gaussian rates, coefficients are integrated out exactly, otherwise by EP (`ep.py`).
+3. Functions: `functions.sampling` uses importance sampling (`mixtures.py`). If its checks fail, it
+   uses NUTS, unless the function has effects.
 """
 
 import json
@@ -17,16 +23,6 @@ from trustbo.inference.classes import (
     OfClass,
     fit_class,
     require_poolable_with_model,
-)
-from trustbo.inference.draws import (
-    as_fitted,
-    in_order_of_features,
-    missions_of,
-    prior_mean,
-    read_params,
-    read_posterior,
-    sample_prior,
-    sample_prior_ahead,
 )
 from trustbo.inference.functions.fit import (
     draws_of_function,
@@ -44,6 +40,16 @@ from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
 from trustbo.inference.functions.source import FunctionData, OfFunction
 from trustbo.inference.latent import Source
 from trustbo.inference.options import Options
+from trustbo.inference.params import (
+    as_fitted,
+    in_order_of_features,
+    missions_of,
+    prior_mean,
+    read_params,
+    read_posterior,
+    sample_prior,
+    sample_prior_ahead,
+)
 from trustbo.inference.tree import Fitted, with_latent
 from trustbo.models.default import default_model
 from trustbo.models.draws import Draws, NextMission
@@ -274,17 +280,17 @@ def params_of(
     Args:
         posterior: DataTree from `fit`.
         workspace: Workspace for planning; features and robots are reordered to match it.
-        next_mission: Whether to draw the robot effects of the next mission, including their
-            persistent part, and to include the effects of robots in bounds. Use True for bands and
-            predictions. By default, expected effects are used, as in planning. The effects of
-            robots in bounds are then left out, because they are 0 on average over the team.
+        next_mission: Whether to draw the robot effects of the next mission, and to include the
+            effects of robots in bounds. Use True for bands and predictions. By default, expected
+            effects are used, as in planning. The effects of robots in bounds are then left out,
+            because they are 0 on average over the team.
         model: Model of the posterior; needed only for a NumPyro function that was not used before
             in this process.
 
     Returns:
         `TrustParams`, `RobotParams` or `CoupledParams`, depending on the model. A pooled model with
         robot effects gives `RobotParams` for the next mission. Their line-of-sight weights include
-        each robot's persistent effect, decayed by one mission. A function gives `Draws`.
+        each robot's effect, whose slow part has decayed by one mission. A function gives `Draws`.
 
     Raises:
         TrustboError: If the posterior is not from `fit`; a variable is missing or has NaN draws; or

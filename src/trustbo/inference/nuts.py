@@ -295,10 +295,10 @@ def sample_by_nuts(
     )
     z = points.z[points.resample(_POINTS, rng)]
 
-    tuning = _OF_SCORES if density.exact else _OF_PROGRAM
+    tuning = _OF_SCORES if density.is_gaussian else _OF_PROGRAM
     if warmup is not None:
         tuning = tuning._replace(warmup=warmup)
-    if density.exact:
+    if density.is_gaussian:
         log_density = _in_jax(density)
         start = Start.near(z, chains, seed)
         constrain = density.scores.values
@@ -314,7 +314,7 @@ def sample_by_nuts(
     found = constrain(samples.points)
     values = {name: found[name] for name in density.scores.priors}
     theta = density.model.theta(values, density.observations.resolution)
-    c = density.draw_coefficients(theta, rng) if density.exact else found["coefficients"]
+    c = density.draw_coefficients(theta, rng) if density.is_gaussian else found["coefficients"]
 
     by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
     summary, complaints = complaints_of(by_chain, samples.fields["diverging"])

@@ -12,7 +12,7 @@ from trustbo.data import Mission, levels_of
 from trustbo.errors import TrustboError, require_choice, require_count, require_whole
 from trustbo.inference.classes import OfClass
 from trustbo.inference.density import Density, JointDraws
-from trustbo.inference.draws import QUANTILES, as_fitted, is_of_people, read_posterior
+from trustbo.inference.params import QUANTILES, as_fitted, is_of_people, read_posterior
 from trustbo.models.families import Family
 from trustbo.models.model import TrustModel
 from trustbo.parallel import computing

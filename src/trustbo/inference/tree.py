@@ -10,8 +10,8 @@ import xarray as xr
 from trustbo.arrays import evenly_spaced
 from trustbo.data import NOWHERE, Mission
 from trustbo.display import slow_bar
-from trustbo.inference.draws import transposed
 from trustbo.inference.latent import N_TRAJECTORIES, Source, latent_of, replicate
+from trustbo.inference.params import transposed
 from trustbo.inference.place_maps import place_group
 from trustbo.models.backend import VERSIONS
 from trustbo.models.effects.effect import Effect

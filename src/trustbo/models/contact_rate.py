@@ -213,7 +213,7 @@ class ContactRate(dist.Distribution):
             )
 
     @property
-    def form(self) -> StateSpace:
+    def space_with_resolution(self) -> StateSpace:
         """State space of the rates: `space` with the noise of their resolution."""
         if not self.adds_resolution:
             return self.space
@@ -224,7 +224,7 @@ class ContactRate(dist.Distribution):
         drift = self.inputs.drift
         inputs = self.inputs._replace(drift=drift + jnp.reshape(jnp.asarray(effects), drift.shape))
         flat = Inputs(*(value.reshape(*value.shape[:2], -1) for value in inputs))
-        return ContactRate.from_space(self.form, flat, self.n_ticks)
+        return ContactRate.from_space(self.space_with_resolution, flat, self.n_ticks)
 
     def log_resolution(self, value: Array) -> Array:
         """Compute the log ratio (mission,) of the probability of tick counts to a density.
@@ -261,7 +261,7 @@ class ContactRate(dist.Distribution):
         rates = jnp.reshape(value, self.inputs.drift.shape)
         by_bound = tuple(jnp.swapaxes(a, 0, 1) for a in (rates, *self.inputs))
 
-        space = self.form
+        space = self.space_with_resolution
 
         def step(belief: kalman.Belief, bound: Any) -> tuple[kalman.Belief, Array]:
             y, *inputs = bound
@@ -284,7 +284,7 @@ class ContactRate(dist.Distribution):
         Raises TrustboError if there are effects.
         """
         self._require_no_effects("draws")
-        space = self.form
+        space = self.space_with_resolution
         shape = *sample_shape, *self.inputs.drift.shape
         w, v, s, e = (random.normal(k, shape) for k in random.split(key, 4))
 

@@ -4,7 +4,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.models.draws import NextMission
-from trustbo.planning.draws import choose_draws, drawn_paths
+from trustbo.planning.drawn_paths import choose_draws, drawn_paths
 from trustbo.planning.problem import InfeasibleError, Problem
 from trustbo.planning.trust_map import cost_of, trust_map
 from trustbo.workspace.moves import cells_along

@@ -28,7 +28,7 @@ from trustbo.kernels import stopwatch
 from trustbo.models.draws import Draws
 from trustbo.models.families import FAMILIES
 from trustbo.parallel import computing
-from trustbo.planning.draws import DrawnPaths, choose_draws, drawn_paths
+from trustbo.planning.drawn_paths import DrawnPaths, choose_draws, drawn_paths
 from trustbo.planning.evaluation import evaluated
 from trustbo.planning.graph import graph_of
 from trustbo.planning.maps import maps_of

@@ -19,7 +19,7 @@ from trustbo.errors import (
     require_share,
 )
 from trustbo.models.draws import Draws
-from trustbo.planning.draws import DrawnPaths, choose_draws
+from trustbo.planning.drawn_paths import DrawnPaths, choose_draws
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
 from trustbo.planning.recursion import Recursion

@@ -199,6 +199,17 @@ class LinearPredictor(NamedTuple):
         return each(self.mean, label) + (self.response[:, label] @ inputs[..., None])[..., 0]
 
 
+def rate_precision(seen: np.ndarray, noise_sd: Any, first: np.ndarray) -> Any:
+    """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured.
+
+    Args:
+        seen: 1 where a rate was measured, otherwise 0, shape (kind, row).
+        noise_sd: See `LinearPredictor`.
+        first: Number of the first block of each kind, shape (kind,).
+    """
+    return seen / each(noise_sd, first) ** 2
+
+
 def each(M: Any, label: np.ndarray) -> Any:
     """Select values (point, block, ...) by block label; a block axis of length 1 is kept."""
     return M if M.shape[1] == 1 else M[:, label]

@@ -5,9 +5,10 @@ Then the lead watches from its stop in c while T2 leaves these posts. In the pre
 lead watched from its stop in a while T2 drove to these posts. The posts of T2 are those positions p
 on a lattice around the stop in a that maximise
 
-    1/2 mean_k s(p, lead at t_k) + 1/4 s(stop in a, p) + 1/4 s(stop in c, p),
+    w mean_k s(p, lead at t_k) + (1 - w) / 2 (s(stop in a, p) + s(stop in c, p)),
 
-where s is the detection probability under the assumed model of sight. Posts are within `RADIUS` of
+where s is the detection probability under the assumed model of sight, and w is `PostSet.watching`,
+0.5 for the standard set. Posts are within `RADIUS` of
 the stop, possibly outside the cell, and away from the lead's route. The slope is well below the
 limit at each post and along at least one way from the post to the stop. The lead stops where the
 routes to the neighbouring stops are most visible.
@@ -17,6 +18,10 @@ distances, and a planner can choose among them in each bound.
 
 Real obstacles may be missing from maps, and mapped obstacles may not block sight. The choice of
 posts and stops allows for such errors (`Posts._seen`); the feature `line_of_sight` does not.
+
+Line of sight, the difficulty of bounds, the routes of plans and the simulator depend on this
+choice. Campaigns store line of sight, but not the posts. After a change of the choice, line of
+sight that was stored before is that of other posts.
 """
 
 from collections.abc import Sequence

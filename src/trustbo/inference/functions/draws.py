@@ -113,15 +113,16 @@ class FunctionDrift:
         `of_missions` are values of the variables of single missions; by default, they are drawn.
         """
         values = {**self.values, **(of_missions or {})}
-        space, inputs = self.model.over_draws("form", 2, data)(values, _keys(self.number))
+        run = self.model.over_draws("space_and_inputs", 2, data)
+        space, inputs = run(values, _keys(self.number))
 
         if inputs.drift.shape[1:3] != data["awareness"].shape[:2]:
             raise TrustboError(self._wrong_size())
         offset = np.any(inputs.offset)
-        if offset or not np.isfinite(inputs.drift).all():
-            reason = "has an offset" if offset else "has a drift that is not finite"
+        if offset or not np.isfinite(_drift_and_noise(inputs)).all():
+            what = "has an offset" if offset else "has a drift or a noise_scale that is not finite"
             raise TrustboError(
-                f"{self.model.in_short()} {reason} in some bounds, and such a model cannot plan. "
+                f"{self.model.in_short()} {what} in some bounds, and such a model cannot plan. "
                 "The inputs n_ticks and duration are not known before a mission."
             )
 

@@ -17,7 +17,7 @@ from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
 from trustbo.statespace import Inputs, StateSpace
-from trustbo.statespace.blocks import Layout, LinearPredictor, each
+from trustbo.statespace.blocks import Layout, LinearPredictor, each, rate_precision
 from trustbo.workspace import Workspace
 
 _LEAST_NOISE = 1e-8
@@ -112,7 +112,7 @@ class AddedEffects(Columns):
         # The drift of the function is known, so its mean contribution is taken off the rates.
         u = layout.rows(inputs.drift)
         known = (each(predictor.response, label) @ u[..., None])[..., 0]
-        precision = blocks.seen / each(predictor.noise_sd, blocks.first) ** 2
+        precision = rate_precision(blocks.seen, predictor.noise_sd, blocks.first)
         return evidence(blocks, predictor, prior, precision, blocks.y - known), prior
 
 

@@ -10,16 +10,6 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_kind
 from trustbo.inference.density import at
-from trustbo.inference.draws import (
-    effects_of,
-    in_order_of,
-    joined_draws,
-    names_in,
-    require_no_nan,
-    require_variables,
-    with_effects,
-    with_prior_effects_ahead,
-)
 from trustbo.inference.functions.checks import require_fittable, require_unpadded_results
 from trustbo.inference.functions.data import data_of_bounds, observations_of
 from trustbo.inference.functions.draws import (
@@ -41,6 +31,16 @@ from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.functions.source import OF_PRIOR, FunctionData, OfFunction
 from trustbo.inference.latent import N_PRIOR
 from trustbo.inference.options import Options
+from trustbo.inference.params import (
+    effects_of,
+    in_order_of,
+    joined_draws,
+    names_in,
+    require_no_nan,
+    require_variables,
+    with_effects,
+    with_prior_effects_ahead,
+)
 from trustbo.inference.tree import Fitted, coords_of, default_draws
 from trustbo.models.draws import Draws, NextMission
 from trustbo.models.observations import Observations

@@ -341,7 +341,7 @@ class FunctionModel:
         without_rates = _WithoutRates(self._at(z, deviations))
         log_p, _ = log_density(without_rates, (data,), {}, {})
         rates = without_rates.rates
-        return Outer(log_p, rates.form, rates.inputs, rates.theta)
+        return Outer(log_p, rates.space_with_resolution, rates.inputs, rates.theta)
 
     def constrain(
         self, z: Mapping[str, Any], data: Data, deviations: Collection[str] = ()
@@ -421,7 +421,7 @@ class FunctionModel:
         if effects is not None:
             rates = rates.given(effects)
         return Found(
-            space=rates.form,
+            space=rates.space_with_resolution,
             inputs=rates.inputs,
             log_prior={
                 name: trace[name]["fn"].log_prob(trace[name]["value"]) for name in latent_in(trace)
@@ -442,7 +442,7 @@ class FunctionModel:
                 log_p[name] = site["scale"] * log_p[name]
 
         return Probe(
-            space=rates.form,
+            space=rates.space_with_resolution,
             inputs=rates.inputs,
             rates=trace[RATES]["value"],
             n_ticks=rates.n_ticks,
@@ -451,7 +451,7 @@ class FunctionModel:
             computed={n: s["value"] for n, s in trace.items() if s["type"] == "deterministic"},
         )
 
-    def form(
+    def space_and_inputs(
         self, values: Mapping[str, Any], key: jax.Array, data: Data
     ) -> tuple[StateSpace, Inputs]:
         """Return the state space, without noise of the resolution, and the inputs."""

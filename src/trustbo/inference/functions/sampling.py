@@ -13,7 +13,6 @@ from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, warn
 from trustbo.inference import mixtures
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, statistics_of
-from trustbo.inference.draws import joined_draws
 from trustbo.inference.functions.coordinates import Coordinates
 from trustbo.inference.functions.data import RATES, Data
 from trustbo.inference.functions.effects import AddedEffects
@@ -22,6 +21,7 @@ from trustbo.inference.functions.function import FunctionModel, Outer
 from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.nuts import Chains, Samples, Start, Tuning
 from trustbo.inference.options import Options
+from trustbo.inference.params import joined_draws
 from trustbo.models.backend import own_settings
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.streams import stream
@@ -413,7 +413,8 @@ def _used_by_plans(
 ) -> dict[str, np.ndarray]:
     """Return the drift in some measured bounds and the form, of shape (chain, draw, number)."""
     n_draws = shape[0] * shape[1]
-    space, inputs = target.model.over_draws("form", 2, target.data)(values, keys_of(n_draws, 0))
+    run = target.model.over_draws("space_and_inputs", 2, target.data)
+    space, inputs = run(values, keys_of(n_draws, 0))
 
     measured = np.flatnonzero(~np.isnan(target.data[RATES].ravel()))
     some = measured[evenly_spaced(len(measured), _CHECKED)]

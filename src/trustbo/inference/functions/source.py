@@ -10,13 +10,13 @@ import xarray as xr
 from trustbo.arrays import evenly_spaced
 from trustbo.data import Mission
 from trustbo.inference.density import at, chunks
-from trustbo.inference.draws import joined_draws, values_of
 from trustbo.inference.functions.data import RATES, arrays_of, data_of
 from trustbo.inference.functions.effects import AddedEffects, layout_of
 from trustbo.inference.functions.function import EFFECTS, Found, FunctionModel
 from trustbo.inference.functions.sampling import keys_of
 from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.latent import N_PRIOR, N_TRAJECTORIES, Given, Source, draw_exactly
+from trustbo.inference.params import joined_draws, values_of
 from trustbo.models.effects.effect import Theta
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations

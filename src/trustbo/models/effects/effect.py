@@ -2,7 +2,7 @@
 
 The drift of all rates is u = U c, where the coefficients c are Gaussian given the hyperparameters
 theta. To add an effect, write a frozen dataclass with the methods of `Effect`. Inference and
-planning need no change.
+planning need no change, unless `design` needs data that `Observations` does not have.
 """
 
 from collections.abc import Mapping, Sequence

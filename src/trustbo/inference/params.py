@@ -603,8 +603,14 @@ def with_prior_effects_ahead(
         places = visited(np.full((1, 1, 3), -1), workspace.grid.shape)
         group = place_group(nowhere, places, robots, f_e=effect.f_e, seed=seed)
 
-    never = {"robot_effect": np.zeros((n_draws, 0, len(robots)))}
-    values = dict.fromkeys(_effects_of_robots(effects), never)
+    sizes = {"mission": 0, "robot": len(robots)}
+    values = {}
+    for effect in _effects_of_robots(effects):
+        lengths = sizes | {axis: len(labels) for axis, labels in effect.coords.items()}
+        values[effect] = {
+            name: np.zeros((n_draws, *(lengths[axis] for axis in axes)))
+            for name, axes in effect.variables.items()
+        }
     ahead = _Ahead(theta, parameters, robots, workspace.features, workspace)
     return ahead.with_effects(group, values, 0, [False, True])
 
