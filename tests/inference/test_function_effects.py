@@ -65,6 +65,19 @@ def with_own_noises(awareness, contact_rate=None, n_ticks=None):
     observed(drift, beta0, delta_w, delta_v, contact_rate, n_ticks, [RobotEffect().sample()])
 
 
+def in_a_plate(awareness, contact_rate=None, n_ticks=None):
+    """An effect whose standard deviations would differ between missions."""
+    level = numpyro.sample("level", dist.Normal(0.3, 0.3))
+    with numpyro.plate("mission", len(awareness)):
+        effect = RobotEffect().sample()
+    observed(level + 0.0 * awareness[..., 0], 0.4, 0.1, 0.1, contact_rate, n_ticks, [effect])
+
+
+def test_an_effect_in_a_plate_is_refused(missions):
+    with pytest.raises(TrustboError, match=r"RobotEffect.sample\(\) was called within"):
+        tb.fit(missions, in_a_plate, progress=False)
+
+
 @pytest.fixture(scope="module")
 def workspace():
     awareness = np.random.default_rng(0).uniform(size=(3, 5, 5, 2))

@@ -16,7 +16,7 @@ from numpy.random import Generator
 from numpyro.distributions import Distribution
 
 from trustbo.data import Mission
-from trustbo.errors import require_positive
+from trustbo.errors import TrustboError, require_positive
 from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
 from trustbo.statespace.matrices import namespace
@@ -121,6 +121,9 @@ class Effect:
     def sample(self) -> SampledEffect:
         """Sample the hyperparameters within a NumPyro function, for `ContactRate(effects=)`.
 
+        Raises:
+            TrustboError: Within a `numpyro.plate`, in which each member would have its own values.
+
         Example:
             >>> places = tb.models.PlaceEffect().sample()
             >>> robots = tb.models.RobotEffect().sample()
@@ -129,6 +132,12 @@ class Effect:
             ... )
         """
         values = {name: numpyro.sample(name, prior) for name, prior in self.hyperpriors().items()}
+        if any(np.ndim(value) for value in values.values()):
+            name = type(self).__name__
+            raise TrustboError(
+                f"{name}.sample() was called within a numpyro.plate; call it before the plate, "
+                "because its standard deviations are the same for all missions, bounds and robots."
+            )
         return SampledEffect(self, values)
 
     def for_features(self, features: Sequence[str], *, of_rates: bool) -> Self:
