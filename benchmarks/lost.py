@@ -13,6 +13,7 @@ With `--rows`, no campaign is run, and the tables are those of the rows of earli
 `--compare`, the first ten missions are compared with rows of version 0.5, which are means.
 """
 
+import copy
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
@@ -22,8 +23,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from baselines import line_of_sight, residual_process, running_mean
+from baselines.paths import PathPolicy
 from common import Table, arguments, parsed
-from groups import GROUPS, KINDS, grounds_of, interval
+from groups import (
+    GROUPS,
+    KINDS,
+    LOST,
+    OURS,
+    by_group,
+    by_kind,
+    grounds_of,
+    interval,
+    print_groups,
+    print_kinds,
+)
 from summary import bootstrap
 from world_set import World, worlds
 
@@ -41,7 +54,6 @@ METHODS: dict[str, dict[str, Any]] = {
     "3 sets of posts": {"n_posts": 3},
 }
 """Arguments of `trustbo.iterate`, and `n_posts` of the workspace, keyed by method."""
-OURS = "trustbo"
 USUAL = (OURS, "running mean", "residual process", "line of sight")
 """Methods that are compared if none is given."""
 COURSES = ("sw-ne", "nw-se")
@@ -104,25 +116,21 @@ def rows_of(
     start, goal = world.ends(course)
     rows = []
     for method in methods:
-        options = dict(METHODS[method])
+        options = copy.deepcopy(METHODS[method])  # policies learn
         workspace = world.workspace(n_posts=options.pop("n_posts", 1))
         simulator = world.simulator(workspace)
-        result = tb.iterate(
-            workspace,
-            start,
-            goal,
-            n_iterations=n_missions,
-            simulator=simulator,
-            seed=4,
-            progress=False,
-            planner=PLANNER,
-            **options,
+        campaign = tb.Campaign(
+            workspace, start, goal, seed=4, progress=False, planner=PLANNER, **options
         )
+        for _, mission in campaign.run(simulator, n_missions, progress=False):
+            if isinstance(campaign.policy, PathPolicy):
+                campaign.policy.learn(campaign, mission)
+
         labels = {"world": world.name, "kind": world.kind, "course": course, "method": method}
-        arrived = np.mean([mission.status == "ok" for mission in result.missions])
-        paths = [*(entry.plan.path for entry in result.state.entries), result.plan.path]
+        arrived = np.mean([mission.status == "ok" for mission in campaign.missions])
+        paths = [*(entry.plan.path for entry in campaign.state.entries), campaign.plan.path]
         changes = [k for k in range(1, len(paths)) if paths[k] != paths[k - 1]]
-        lost = {lost_after(k): lost_in(mission) for k, mission in enumerate(result.missions)}
+        lost = {lost_after(k): lost_in(mission) for k, mission in enumerate(campaign.missions)}
         rows.append(labels | {"settled": max(changes, default=0), "arrive": arrived} | lost)
     return rows
 
@@ -149,14 +157,12 @@ def lost_in(mission: tb.Mission) -> float:
 
 
 def report(rows: pd.DataFrame) -> None:
-    """Print the mean of each method by group and kind, and the paired differences of methods."""
-    table = Table("worlds", "n", *rows["method"].unique(), first=26)
-    for name, kinds in groups().items():
-        some = rows[rows["kind"].isin(kinds)]
-        if len(some):
-            means = some.groupby("method", sort=False)["lost"].mean()
-            table.row(name, some["world"].nunique(), *(f"{x:.3f}" for x in means))
+    """Print the means of trustbo and of baselines, and the paired differences of all methods."""
+    named = rows.rename(columns={"lost": LOST})
+    print_groups(by_group(named))
+    print_kinds(by_kind(named))
     print()
+
     first, *others = rows["method"].unique()
     for name in others:
         print(f"{name} (ours) and {first} (other)")
