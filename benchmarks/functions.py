@@ -401,8 +401,7 @@ def with_rates(awareness, rates, features):
     """Make a mission with any rates; simulated ones may leave [0, 1], which missions refuse."""
     inside = np.full(rates.shape, 0.5)
     mission = tb.Mission.from_arrays(None, awareness, inside, features=features)
-    for bound, of_bound in zip(mission.bounds, rates, strict=True):
-        object.__setattr__(bound, "contact_rate", of_bound)
+    object.__setattr__(mission, "contact_rate", np.array(rates))
     return mission
 
 

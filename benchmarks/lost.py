@@ -113,19 +113,9 @@ def rows_of(
     world: World, course: str, methods: Sequence[str], n_missions: int
 ) -> list[dict[str, object]]:
     """Run one campaign of each method; return the rows."""
-    start, goal = world.ends(course)
     rows = []
     for method in methods:
-        options = copy.deepcopy(METHODS[method])  # policies learn
-        workspace = world.workspace(n_posts=options.pop("n_posts", 1))
-        simulator = world.simulator(workspace)
-        campaign = tb.Campaign(
-            workspace, start, goal, seed=4, progress=False, planner=PLANNER, **options
-        )
-        for _, mission in campaign.run(simulator, n_missions, progress=False):
-            if isinstance(campaign.policy, PathPolicy):
-                campaign.policy.learn(campaign, mission)
-
+        campaign = campaign_of(world, course, method, n_missions)
         labels = {"world": world.name, "kind": world.kind, "course": course, "method": method}
         arrived = np.mean([mission.status == "ok" for mission in campaign.missions])
         paths = [*(entry.plan.path for entry in campaign.state.entries), campaign.plan.path]
@@ -133,6 +123,19 @@ def rows_of(
         lost = {lost_after(k): lost_in(mission) for k, mission in enumerate(campaign.missions)}
         rows.append(labels | {"settled": max(changes, default=0), "arrive": arrived} | lost)
     return rows
+
+
+def campaign_of(world: World, course: str, method: str, n_missions: int) -> tb.Campaign:
+    """Run a campaign of a method; baselines learn from each mission."""
+    options = copy.deepcopy(METHODS[method])
+    workspace = world.workspace(n_posts=options.pop("n_posts", 1))
+    campaign = tb.Campaign(
+        workspace, *world.ends(course), seed=4, progress=False, planner=PLANNER, **options
+    )
+    for _, mission in campaign.run(world.simulator(workspace), n_missions, progress=False):
+        if isinstance(campaign.policy, PathPolicy):
+            campaign.policy.learn(campaign, mission)
+    return campaign
 
 
 def lost_after(n_missions: int) -> str:
