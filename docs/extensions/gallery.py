@@ -26,7 +26,9 @@ _NOTEBOOKS = (
 )
 _PICTURES = {"compare_models": 3}
 """Index of the stored picture of a notebook that is shown; by default, the first one."""
-_START, _GOAL = (7, 0), (0, 3)
+_START, _GOAL = (7, 0), (0, 5)
+_SCRUB = (2, 1)
+"""Cell in the middle of scrub that has grown since the survey, on the first path."""
 
 
 class Figure(NamedTuple):
@@ -41,7 +43,7 @@ class Figure(NamedTuple):
 
 
 def figures() -> Iterator[Figure]:
-    """Run a small campaign with a poor robot on the terrain of the package, and yield figures."""
+    """Run a small campaign with a poor robot and an outdated map, and yield figures of it."""
     import arviz as az
 
     import trustbo as tb
@@ -49,7 +51,8 @@ def figures() -> Iterator[Figure]:
     terrain = tb.terrain.example()
     workspace = tb.Workspace.from_terrain(terrain, shape=(8, 6))
     damage = tb.simulation.Degradation("r2", detection=0.6)
-    simulator = tb.simulation.KinematicSimulator(workspace, events=[damage])
+    scrub = tb.simulation.Trees(3.0, workspace.grid.center(_SCRUB), 40.0)
+    simulator = tb.simulation.KinematicSimulator(workspace, events=[damage, scrub])
     result = tb.iterate(
         workspace, _START, _GOAL, n_iterations=6, planner={"failure_cost": 9.0},
         simulator=simulator, progress=False,
@@ -58,7 +61,7 @@ def figures() -> Iterator[Figure]:
     robots = tb.check(result.posteriors).robots
     maps = result.history, result.trust_map, result.path
     sd = result.maps()["trust_sd"]
-    size = {"figsize": (6, 3.6)}
+    size = {"figsize": (5.2, 3.4)}
 
     def forest() -> Any:
         weights = ["beta0", "beta", "b"]
@@ -71,6 +74,7 @@ def figures() -> Iterator[Figure]:
         "trustbo.plots.terrain_maps", lambda: plots.terrain_maps(workspace),
         "Height of the surface, and the three features of awareness. Line of sight is averaged "
         "over moves and robots. Grey cells are impassable.",
+        wide=True,
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.trust_maps",

@@ -16,7 +16,7 @@ from matplotlib import patheffects
 import trustbo as tb
 from trustbo import plots
 from trustbo.plots.explorer import _layers
-from trustbo.plots.maps import draw_contours, draw_path, extent_of, limits_of
+from trustbo.plots.maps import draw_contours, draw_path, extent_of, limits_of, path_in
 from trustbo.report import bounds_of, facts_of, write_report
 
 EFFECTS = pd.DataFrame(
@@ -192,6 +192,21 @@ def test_a_path_goes_through_the_centres_of_its_cells(result):
     np.testing.assert_allclose(ax.lines[0].get_xydata(), [(10.0, 10.0), (30.0, 30.0)])
 
 
+def test_bounds_that_other_posts_watch_are_coloured_and_named(result):
+    _, ax = plt.subplots()
+    draw_path(ax, [(3, 0), (2, 1, "route"), (1, 1), (0, 2)], result.workspace.grid)
+    (coloured,) = ax.collections
+    np.testing.assert_allclose(coloured.get_segments(), [[(30.0, 30.0), (30.0, 50.0)]])
+    assert "route posts" in ax.get_legend_handles_labels()[1]
+
+
+def test_a_path_in_a_history_has_its_sets_of_posts():
+    steps = np.array([(3, 0), (2, 1), (0, 2), (-1, -1)])
+    mission = xr.Dataset({"path": (("step", "axis"), steps), "posts": ("bound", [0, 2, -1])})
+    assert path_in(mission) == [(3, 0, "standard"), (2, 1, "route"), (0, 2)]
+    assert path_in(mission.drop_vars("posts")) == [(3, 0), (2, 1), (0, 2)]
+
+
 @pytest.mark.parametrize(("relief", "interval"), [(0.0, None), (12.0, 1), (24.0, 2), (60.0, 5)])
 def test_contour_lines_of_a_plane_are_level_and_at_round_heights(relief, interval):
     terrain = tb.terrain.synthetic_terrain((80.0, 60.0), 2.0, seed=0, relief=4.0)
@@ -270,6 +285,7 @@ def test_the_explorer_is_one_page_without_addresses(result, tmp_path):
     assert '<script src="http' not in html
     assert '<link rel="stylesheet" href="http' not in html
     assert "trust mean" in html
+    assert "@set, bound @bound" in html  # the set of the posts at the pointer
     assert "<title>Path from 3,0 to 0,2 after 2 missions</title>" in html
     assert len(repr(page)) < 100
     assert page._repr_html_().startswith("<iframe")
@@ -423,15 +439,14 @@ def test_the_report_has_the_limits_of_all_robots_and_marks_replanned_missions(tm
 
 
 @pytest.mark.parametrize(("bounds", "n"), [([], 1), ([2], 2)])
-def test_the_map_of_the_path_alone_shows_all_posts(result, bounds, n):
+def test_the_map_of_the_path_shows_all_posts(result, bounds, n):
     axes = plots.plan_map(result.plan, bounds=bounds)
     assert len(axes) == n
     corner = np.array(result.workspace.grid.corner)
     drawn = [line.get_xydata() for line in axes[0].lines]
     for i in range(result.workspace.team.n_robots):
         posts = result.plan.posts[:, i] - corner
-        found = any(a.shape == posts.shape and np.allclose(a, posts) for a in drawn)
-        assert found == (n == 1)
+        assert any(a.shape == posts.shape and np.allclose(a, posts) for a in drawn)
 
 
 def test_the_report_has_contact_and_not_the_logit_of_it(result):

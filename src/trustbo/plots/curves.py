@@ -148,22 +148,22 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
     changed = history["path_changed"].values.astype(bool) | (mission == 1)
     failed = history["status"].values.astype(str) != "ok"
     prefix = "measured, " if predicts_lost else ""
-    dots = (changed, accent(), f"{prefix}new path"), (~changed, "none", f"{prefix}same path")
+    dots = (changed, accent(), f"{prefix}new path"), (~changed, background(), f"{prefix}same path")
 
-    height = 2.2 if len(names) == 1 else 1.6  # in inches
-    axes = panels(len(names), ax, (4.6, height), columns=1, sharex=True)
+    height = 2.6 if len(names) == 1 else 1.8  # in inches
+    axes = panels(len(names), ax, (4.0, height), columns=1, sharex=True)
     for panel, name in zip(axes, names, strict=True):
         values = history[name].values
-        panel.plot(mission, values, color=accent(), linewidth=1.0)
+        panel.plot(mission, values, color=accent(), linewidth=1.6)
         if name == "contact_lost" and predicts_lost:
-            style = {"color": ink(), "linewidth": 1.2, "label": "predicted by the plan"}
-            panel.plot(mission, -history["objective"].values, ".:", **style)
+            style = {"color": ink(), "markersize": 14.0, "label": "predicted by the plan"}
+            panel.plot(mission, -history["objective"].values, "_", markeredgewidth=1.6, **style)
         for which, fill, label in dots:
             style = {"color": accent(), "markerfacecolor": fill, "label": label}
-            panel.plot(mission[which], values[which], "o", markersize=5.5, **style)
+            panel.plot(mission[which], values[which], "o", markersize=6.5, **style)
         if failed.any():
-            cross = {"color": ROBOTS[1], "markersize": 9.0, "label": "goal not reached"}
-            panel.plot(mission[failed], values[failed], "x", **cross)
+            cross = {"color": ROBOTS[1], "markersize": 11.0, "label": "goal not reached"}
+            panel.plot(mission[failed], values[failed], "x", markeredgewidth=2.0, **cross)
 
         panel.set_ylabel(_LABELS[name])
         panel.margins(y=_MARGIN)
@@ -206,9 +206,12 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
     for name in ("mission", "robot", "effect", "sd", "stands_out"):
         require_choice("column", name, [str(column) for column in table.columns])
 
-    axes = panels(1, ax, (5.0, 2.6))
+    axes = panels(1, ax, (4.0, 2.6))
     panel = axes[0]
     panel.axhspan(-SMALL_EFFECT, SMALL_EFFECT, color=GREY, alpha=0.25, linewidth=0.0)
+    place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+    place |= {"ha": "right", "va": "top"}
+    panel.annotate("small effect", (1.0, SMALL_EFFECT), (-2.0, -1.0), color=ink(), **place)
     robots = table["robot"].unique()
     shifts = np.linspace(-_SPREAD, _SPREAD, len(robots)) if len(robots) > 1 else [0.0]
 
@@ -221,6 +224,7 @@ def robot_effects(table: pd.DataFrame, *, ax: Axes | None = None) -> Axes:
         panel.plot(x, y, marker, color=colour, markerfacecolor=background(), label=name)
         panel.plot(odd["mission"] + shift, odd["effect"], marker, color=colour)
 
+    panel.margins(y=_MARGIN)
     panel.set(xlabel="mission", ylabel="effect on contact\nat full sight")
     panel.xaxis.set_major_locator(MaxNLocator(integer=True))
     add_legend(axes, handles_of(panel))

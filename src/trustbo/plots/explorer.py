@@ -8,23 +8,23 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Cell, path_text
+from trustbo.data import POST_SETS, Station, path_text
 from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
 from trustbo.plots.maps import (
-    cells_of,
     extent_of,
     is_good_high,
     is_trust,
     limits_of,
+    path_in,
     positions_of,
     shown_values,
     smooth_ground,
 )
 from trustbo.plots.style import robot_looks
 from trustbo.workspace.grid import Grid
-from trustbo.workspace.moves import cells_along
+from trustbo.workspace.moves import posts_along
 
 _PLANNED_ON = "trust map used to plan the mission"
 _BOKEH_MARKERS = {"o": "circle", "s": "square", "D": "diamond", "^": "triangle",
@@ -110,8 +110,9 @@ def _layout(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Any:
     grid = plan.workspace.grid
     layers = _layers(plan, maps, history)
     looks = _looks(layers, maps)
-    paths = [_places(cells_of(steps), grid) for steps in history["path"].values]
-    texts = [_text(history.isel(iteration=i), plan.objective) for i in range(len(paths))]
+    missions = [history.isel(iteration=i) for i in range(history.sizes["iteration"])]
+    paths = [_places(path_in(mission), grid) for mission in missions]
+    texts = [_text(mission, plan.objective) for mission in missions]
 
     plot, of_plot = _plot_cells(plan, layers, looks)
     planned = models.ColumnDataSource(paths[-1])
@@ -176,7 +177,7 @@ def _plot_cells(
     names = [name for name in looks if name in layers]
     columns: dict[str, Any] = {name: values.ravel() for name, values in layers.items()}
     columns |= {"cell_row": row, "cell_col": col, "value": columns[names[0]]}
-    columns |= _places(np.column_stack([row, col]), grid)
+    columns |= _places(list(zip(row, col, strict=True)), grid)
     cells = models.ColumnDataSource(columns)
 
     look = looks[names[0]]
@@ -240,8 +241,10 @@ def _looks(layers: dict[str, np.ndarray], maps: xr.Dataset) -> dict[str, Any]:
 
 def _draw_plan(plot: Any, plan: Plan) -> None:
     """Plot the recommended path and, with a terrain, the posts and routes of the robots."""
+    from bokeh import models
+
     grid = plan.workspace.grid
-    path = _places(cells_along(plan.path), grid)
+    path = _places(plan.path, grid)
     for colour, width in (("black", 5), ("white", 3)):
         plot.line(**path, color=colour, line_width=width, legend_label="recommended")
     for k, marker in ((0, "circle"), (-1, "star")):
@@ -251,6 +254,9 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
     if plan.posts is None or plan.routes is None:
         return
 
+    sets = [POST_SETS[k] for k in posts_along(plan.path)]
+    of_bounds = {"bound": list(range(1, 1 + len(sets))), "set": sets}
+    drawn = []
     for i, (name, colour, marker) in enumerate(robot_looks(plan.workspace.team.names)):
         x, y = (plan.posts[:, i] - grid.corner).T
         routes = [
@@ -258,11 +264,17 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
         ]
         look = {"color": colour, "legend_label": f"posts of {name}"}
         shape = _BOKEH_MARKERS.get(marker, "plus")
-        plot.scatter(x, y, marker=shape, size=8, line_color="white", **look)
+        posts = models.ColumnDataSource({**of_bounds, "x": x, "y": y, "robot": [name] * len(x)})
+        drawn.append(
+            plot.scatter("x", "y", source=posts, marker=shape, size=8, line_color="white", **look)
+        )
         plot.multi_line([r[:, 0] for r in routes], [r[:, 1] for r in routes], **look)
 
+    tips = [("robot", "@robot"), ("posts", "@set, bound @bound")]
+    plot.add_tools(models.HoverTool(renderers=drawn, tooltips=tips))
 
-def _places(path: Sequence[Cell] | np.ndarray, grid: Grid) -> dict[str, Any]:
+
+def _places(path: Sequence[Station], grid: Grid) -> dict[str, Any]:
     """Return the data source of cells or of a line along a path; see `positions_of`."""
     x, y = positions_of(path, grid).T.tolist()
     return {"x": x, "y": y}
@@ -278,7 +290,7 @@ def _text(mission: xr.Dataset, objective: str) -> str:
     return (
         f"<b>Mission {int(mission['iteration'])}</b>: {escape(str(mission['status'].item()))}, "
         f"contact rate {_measured(mission['contact_rate'], '.3f')}, "
-        f"plan of {len(cells_of(mission['path'].values)) - 1} bounds, "
+        f"plan of {len(path_in(mission)) - 1} bounds, "
         f"{predicted}"
     )
 

@@ -9,16 +9,19 @@ import xarray as xr
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from scipy.ndimage import gaussian_filter
 
-from trustbo.data import Cell, Station
+from trustbo.data import POST_SETS, Cell, Station
 from trustbo.errors import TrustboError, require_kind, require_list, require_tuple, require_whole
 from trustbo.plots.style import (
     GREY,
     N_INTERVALS,
+    PAGE,
+    ROBOTS,
     add_legend,
     as_text,
     background,
@@ -33,7 +36,7 @@ from trustbo.plots.style import (
 )
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Grid
-from trustbo.workspace.moves import cells_along, require_on_grid
+from trustbo.workspace.moves import cells_along, posts_along, require_on_grid
 
 MOMENTS = (1, 2, 4)
 """Missions for which `trust_maps` plots the map used for planning, by default."""
@@ -47,8 +50,12 @@ _SMOOTH = 0.01
 """Standard deviation of the smoothing, as a fraction of the raster's longer side."""
 _ROBUST = (0.02, 0.98)
 """Quantiles at the ends of the colour scale."""
-_BESIDE = 1.1
+_BESIDE = 1.2
 """Width of axis labels and colour bar, in inches."""
+_ABOVE = 0.25
+"""Height of the title of a map, in inches."""
+_BELOW = 0.75
+"""Height of the axis labels and the legend below maps, in inches."""
 _LOGIT = 1.5
 """Trust above this value is on the logit scale of beta-binomial models."""
 BRIGHT_HIGH = "viridis"
@@ -69,16 +76,16 @@ _BAR_LOW = 0.045
 """Height of the scale bar above the edge of a map, as a fraction of the height of the map."""
 _EXTENDED = {(False, False): "neither", (True, False): "min", (False, True): "max"}
 """Pointed ends of a colour bar, keyed by whether values are below and above its limits."""
-_WIDTH = 7.0
-"""Width of a new figure of the grid, in inches."""
+_CELL = 0.38
+"""Width of a cell in a new figure of the grid, in inches, unless the figure exceeds the page."""
+_NAMED = 0.33
+"""Width of a cell, in inches, from which its name fits, such as "10,12"."""
+_TICKED = 0.25
+"""Distance between ticks at rows and columns, in inches, at least."""
 _HEIGHTS = (2.0, 11.0)
 """Least and largest height of a new figure of the grid, in inches."""
-_LARGEST_LABEL = 8.0
-"""Size of the labels of cells, points, if cells are wide enough."""
-_LABEL_WIDTH = 3.2
-"""Width of a label, such as "10,12", per size."""
-_MAX_LABELLED = 24
-"""Number of rows or columns up to which every cell is labelled."""
+_OF_SETS = ("white", ROBOTS[5], ROBOTS[4])
+"""Colours of the bounds of a path, by the set of posts from which T2 watches them."""
 
 
 @styled
@@ -123,7 +130,7 @@ def trust_maps(
     require_kind("trust_map", trust_map, xr.DataArray, "give Result.trust_map")
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
 
-    recommended = require_path_of_cells(path, workspace)
+    recommended = _require_path(path, workspace)
     n_missions = history.sizes["iteration"]
     if missions is None:
         chosen = [i for i in MOMENTS if i <= n_missions]
@@ -135,10 +142,10 @@ def trust_maps(
     maps = np.stack(
         [shown_values(values, workspace) for values in [*planned["trust_map"], trust_map]]
     )
-    paths = [*map(cells_of, planned["path"].values), recommended]
+    paths = [*(path_in(planned.isel(iteration=i)) for i in range(len(chosen))), recommended]
     learned = [*(i - 1 for i in chosen), n_missions]
 
-    maps[:, *path[0]] = np.nan
+    maps[:, *path[0][:2]] = np.nan
     norm = Normalize(*limits_of(maps[np.array(learned) > 0], is_trust=True))
 
     axes = map_panels(workspace.grid, len(maps), ax)
@@ -154,7 +161,8 @@ def trust_maps(
 
     _trust_bar(axes, ScalarMappable(norm), maps, "expected trust", explain=True)
     if ax is None:
-        handles = [*handles_of(axes[0]), Patch(facecolor=GREY, label="impassable or start")]
+        drawn = {handle.get_label(): handle for panel in axes for handle in handles_of(panel)}
+        handles = [*drawn.values(), Patch(facecolor=GREY, label="impassable or start")]
         if driven is not None:
             handles.append(Patch(facecolor="0.9", label="never entered", **_HATCH))
         add_legend(axes, handles)
@@ -165,8 +173,8 @@ def trust_maps(
 def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
     """Plot the heights of the DSM and the index of each feature (Fig. 4 of the paper).
 
-    Features of bounds, such as line of sight, are averaged over robots and over all bounds that
-    enter a cell.
+    High ground is bright. Features of bounds, such as line of sight, are averaged over robots and
+    over all bounds that enter a cell.
 
     Args:
         workspace: Workspace made from a terrain.
@@ -193,8 +201,10 @@ def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
     extent = extent_of(grid)
     of_cells = workspace.awareness.mean(("robot", "move"))
 
-    heights = surface.imshow(terrain["dsm"].values, cmap="cividis", extent=extent)
-    surface.set_title("surface (DSM)")
+    height = terrain["dsm"].values
+    surface.imshow(height, cmap="cividis", extent=extent)
+    surface.set_title(f"surface (DSM)\n{np.nanmin(height):.0f} to {np.nanmax(height):.0f} m")
+    draw_contours(surface, workspace, "black", 0.25)
 
     for panel, name in zip(others, workspace.features, strict=True):
         index = pixels[name].values if name in pixels else of_cells.sel(feature=name).values
@@ -202,11 +212,6 @@ def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
         panel.imshow(index, vmin=0.0, vmax=1.0, extent=extent)
         panel.set_title(as_text(name))
 
-    for panel in axes:
-        draw_contours(panel, workspace, "black", 0.25)
-        _draw_edges(panel, *edges_of(grid), color="white", linewidth=0.3)
-
-    colour_bar(axes, heights, "height (m)", location="bottom", aspect=40)
     colour_bar(axes, ScalarMappable(Normalize(0.0, 1.0)), "index\n(0 worst, 1 best)")
     return axes
 
@@ -261,7 +266,7 @@ def cell_map(
         norm.vmin, norm.vmax = limits_of(shown, (0.0, 1.0), is_trust=is_trust(name))
     if label is not None:
         require_kind("label", label, str, "give a text; '' for no colour bar")
-    cells = None if path is None else require_path_of_cells(path, workspace)
+    cells = None if path is None else _require_path(path, workspace)
 
     axes = map_panels(workspace.grid, 1, ax)
     good = BRIGHT_HIGH if is_good_high(name) else BRIGHT_LOW
@@ -269,6 +274,8 @@ def cell_map(
 
     if cells is not None:
         draw_path(axes[0], cells, workspace.grid)
+        if ax is None:
+            add_legend(axes, handles_of(axes[0]))
     if label == "":
         return axes[0]
 
@@ -284,7 +291,8 @@ def cell_map(
 def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
     """Plot the mean height of each cell, labelled with its row and column.
 
-    Impassable cells are hatched. Without a terrain, passable cells are blank.
+    If the labels do not fit, rows and columns have ticks. Impassable cells, which are too steep or
+    have no data or no room for the team, are grey. Without a terrain, passable cells are blank.
 
     Args:
         workspace: Workspace of the cells.
@@ -301,29 +309,33 @@ def grid_map(workspace: Workspace, *, ax: Axes | None = None) -> Axes:
     rows, cols = grid.shape
 
     tall = grid.cell_height / grid.cell_width
-    height = float(np.clip(_WIDTH * rows * tall / cols, *_HEIGHTS))
-    axes = panels(1, ax, (_WIDTH, height))
+    width = float(np.clip(_CELL * cols + _BESIDE, 4.0, PAGE))
+    height = float(np.clip((width - _BESIDE) * rows * tall / cols + _ABOVE + _BELOW, *_HEIGHTS))
+    axes = panels(1, ax, (width, height))
     panel = axes[0]
+    room = figure_of(axes).get_figwidth() * panel.get_position().width / cols  # inches
 
     x = np.arange(cols + 1) - 0.5
     y = np.arange(rows + 1) - 0.5
 
     if workspace.terrain is not None:
-        light = ListedColormap(colormaps["YlOrBr"](np.linspace(0.0, 0.55, 256)))
+        light = ListedColormap(colormaps["YlOrBr"](np.linspace(0.0, 0.35, 256)))
         image = panel.pcolormesh(x, y, grid.cell_means(workspace.terrain["dem"]), cmap=light)
-        colour_bar(axes, image, "mean height (m)", pad=0.05)
+        colour_bar(axes, image, "mean height (m)")
 
-    _hatch(panel, x, y, ~workspace.passable.values, "0.8", hatch="///", edgecolor="0.6", lw=0.0)
+    _fill(panel, x, y, ~workspace.passable.values, GREY, lw=0.0)
     _draw_edges(panel, x, y, color="black", linewidth=0.4)
 
-    if max(rows, cols) <= _MAX_LABELLED:
-        room = figure_of(axes).get_figwidth() * panel.get_position().width / cols  # inches
-        size = min(_LARGEST_LABEL, 72.0 * room / _LABEL_WIDTH)  # 72 points per inch
+    step = math.ceil(_TICKED / room)
+    ticks = {"xticks": range(0, cols, step), "yticks": range(0, rows, step)}
+    if room >= _NAMED:
+        ticks = {"xticks": [], "yticks": []}
         for row, col in np.ndindex(*grid.shape):
-            panel.text(col, row, f"{row},{col}", ha="center", va="center", size=size, color="black")
+            panel.text(col, row, f"{row},{col}", ha="center", va="center", color="black")
 
-    panel.set(xlabel="column", ylabel="row", xlim=x[[0, -1]], ylim=y[[-1, 0]], aspect=tall)
-    panel.set_title(f"{grid.crs_name}\nhatched: without data or too steep")
+    panel.set(**ticks, xlabel="column", ylabel="row", xlim=x[[0, -1]], ylim=y[[-1, 0]], aspect=tall)
+    panel.set_title(grid.crs_name)
+    add_legend(axes, [Patch(facecolor=GREY, label="impassable")])
     return panel
 
 
@@ -337,33 +349,45 @@ def is_good_high(name: str) -> bool:
     return name != "cost" and not name.endswith(("_sd", " sd"))
 
 
-def require_path_of_cells(path: Sequence[Station], workspace: Workspace) -> np.ndarray:
-    """Return the cells of a path, shape (cell, 2).
-
-    Raises TrustboError if there are none, or if one is off the grid.
-    """
+def _require_path(path: Sequence[Station], workspace: Workspace) -> tuple[Station, ...]:
+    """Return a path; raises TrustboError if it is empty, or if a cell is off the grid."""
     cells = require_on_grid(path, workspace.grid.shape)
     if not cells:
         raise TrustboError("path must contain at least one cell; got none.")
-    return cells_along(cells)
+    return cells
 
 
-def cells_of(steps: np.ndarray) -> np.ndarray:
-    """Return the cells of a path in a history, shape (step, 2), without the padding of -1."""
-    return steps[steps[:, 0] >= 0]
+def path_in(mission: xr.Dataset) -> list[Station]:
+    """Return the path of a mission in a history, with the sets of posts if there are several."""
+    cells = [tuple(cell) for cell in mission["path"].values.tolist() if cell[0] >= 0]
+    if "posts" not in mission:
+        return cells
+
+    sets = [POST_SETS[k] for k in mission["posts"].values]
+    return [*((*cell, name) for cell, name in zip(cells[:-1], sets, strict=False)), cells[-1]]
 
 
-def positions_of(path: Sequence[Cell] | np.ndarray, grid: Grid) -> np.ndarray:
+def positions_of(path: Sequence[Station], grid: Grid) -> np.ndarray:
     """Return positions of a path's cells, (cell, 2), in metres from the lower left corner."""
-    row, col = np.transpose(path)
+    row, col = cells_along(path).T
     return np.column_stack([grid.x[col], grid.y[row]]) - grid.corner
 
 
-def draw_path(ax: Axes, path: Sequence[Cell] | np.ndarray, grid: Grid) -> None:
-    """Plot a path over a map, from its start (circle) to its goal (star)."""
+def draw_path(ax: Axes, path: Sequence[Station], grid: Grid) -> None:
+    """Plot a path over a map, from its start (circle) to its goal (star).
+
+    The bounds that T2 watches from other sets of posts than the standard one are coloured.
+    """
     places = positions_of(path, grid)
-    outline = outlined(3.2, "black")
-    ax.plot(*places.T, "w", linewidth=1.6, solid_joinstyle="round", path_effects=outline)
+    outline = outlined(3.6, "black")
+    ax.plot(*places.T, "w", linewidth=2.0, solid_joinstyle="round", path_effects=outline)
+
+    bounds = np.stack([places[:-1], places[1:]], 1)
+    sets = posts_along(path)
+    for k in np.unique(sets[sets > 0]):
+        style: dict[str, Any] = {"colors": _OF_SETS[k], "label": f"{POST_SETS[k]} posts"}
+        ax.add_collection(LineCollection([*bounds[sets == k]], linewidths=2.0, **style))
+
     ax.plot(*places[0], "wo", markeredgecolor="black", markersize=6, label="start")
     ax.plot(*places[-1], "w*", markeredgecolor="black", markersize=11, label="goal")
 
@@ -372,11 +396,12 @@ def map_panels(grid: Grid, n: int, ax: Any) -> np.ndarray:
     """Return axes for n maps, in metres from the lower left corner; the first has a scale bar."""
     _, right, _, top = extent_of(grid)
     tall = float(np.clip(top / right, 0.3, 3.0))
-    width = 3.0 if n > 1 else 4.0
-    columns = 2 if n == 4 else 3
+    columns = min(n, 2 if n == 4 else 3)
+    width = min(3.0 if n > 1 else 4.0, PAGE / columns)
 
-    inner = width - _BESIDE / min(n, columns)
-    axes = panels(n, ax, (width, inner * tall + 0.4), columns=columns)
+    inner = width - _BESIDE / columns
+    height = inner * tall + _ABOVE + _BELOW / math.ceil(n / columns)
+    axes = panels(n, ax, (width, height), columns=columns)
 
     for panel in axes:
         set_frame(panel, grid, xlabel="east (m)", ylabel="north (m)")
@@ -429,8 +454,7 @@ def _trust_bar(
 
     is_above = bar.extend in ("max", "both")
     if explain and (figure_of(axes).get_size_inches() >= _LEAST_SIZE).all():
-        more = "; estimates\ncan be higher" if is_above else ""
-        bar.set_label(f"{label}\n(1: unbroken\ncontact{more})")  # short lines, as bars are short
+        bar.set_label(in_lines(f"{label}\n(1: unbroken contact)", axes))
     if is_above:
         bar.formatter = FuncFormatter(lambda x, _: "≥ 1" if math.isclose(x, 1.0) else f"{x:.4g}")
         bar.update_ticks()
@@ -459,13 +483,13 @@ def shown_values(values: xr.DataArray, workspace: Workspace) -> np.ndarray:
 def hatch_undriven(ax: Axes, driven: np.ndarray, workspace: Workspace) -> None:
     """Hatch the passable cells that were not `driven`, shape (row, col)."""
     new = workspace.passable.values & ~driven
-    _hatch(ax, *edges_of(workspace.grid), new, "none", **_HATCH)
+    _fill(ax, *edges_of(workspace.grid), new, "none", **_HATCH)
 
 
-def _hatch(
+def _fill(
     ax: Axes, x: np.ndarray, y: np.ndarray, cells: np.ndarray, colour: str, **style: Any
 ) -> None:
-    """Hatch the given `cells`, a mask (row, col), between the edges x (col + 1,), y (row + 1,)."""
+    """Fill or hatch cells, a mask (row, col), between the edges x (col + 1,) and y (row + 1,)."""
     shown = np.ma.masked_array(np.ones(cells.shape), ~cells)
     ax.pcolor(x, y, shown, cmap=ListedColormap([colour]), **style)
 

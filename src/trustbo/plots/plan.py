@@ -24,7 +24,6 @@ from trustbo.plots.style import (
     styled,
 )
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import cells_along
 
 _VEGETATION = (0.44, 0.56, 0.39, 0.4)
 """Colour of vegetation: a semi-transparent green for light and dark backgrounds."""
@@ -42,15 +41,15 @@ _LEAST_HALF = 2.0
 
 @styled
 def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None) -> np.ndarray:
-    """Plot a map of the path of a plan, and a map of each bound.
+    """Plot a map of the path of a plan with the posts of all bounds, and a map of each bound.
 
+    The path is coloured where T2 watches from other sets of posts than the standard one.
     The map of a bound shows the lead's route between its stops, the posts of the other robots with
     their sight lines to the lead's next stop, and the routes to their next posts.
 
     Args:
         plan: Plan on a terrain, such as `Result.plan`.
-        bounds: Numbers of the bounds to plot, from 1; by default all. `[]` plots only the
-            path, with the posts of all bounds.
+        bounds: Numbers of the bounds to plot, from 1; by default all. `[]` plots only the path.
         ax: Axes to draw on, one for the path and one for each bound; by default a new figure.
 
     Returns:
@@ -70,11 +69,11 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     for k in shown:
         require_whole("bounds: a number", k, 1, n_bounds)
 
-    size = (2.5, 2.6) if len(shown) else (5.0, 4.4)  # in inches
+    size = (2.5, 3.0) if len(shown) else (5.0, 4.4)  # in inches
     axes = panels(1 + len(shown), ax, size)
     for panel in axes:
         draw_ground(panel, plan.workspace)
-    draw_path(axes[0], cells_along(plan.path), plan.workspace.grid)
+    draw_path(axes[0], plan.path, plan.workspace.grid)
     axes[0].set_title(f"path of {n_bounds} bounds")
     draw_scale(axes[0])
 
@@ -83,12 +82,10 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
         ends = (path_text([station]) for station in plan.path[k - 1 : k + 1])
         panel.set_title(f"bound {k}\n{' to '.join(ends)}")
 
-    names = plan.workspace.team.names
-    if len(shown):
-        handles = _legend(names)
-    else:
-        _draw_posts(axes[0], plan)
-        handles = handles_of(axes[0])
+    of_path = handles_of(axes[0])
+    _draw_posts(axes[0], plan)
+    of_bounds = [*of_path, *_legend(plan.workspace.team.names)]
+    handles = of_bounds if len(shown) else handles_of(axes[0])
     add_legend(axes, [*handles, Patch(facecolor=_VEGETATION, label="vegetation")])
     return axes
 

@@ -32,6 +32,7 @@ RC: dict[str, Any] = {
     "axes.spines.right": False,
     "image.cmap": "viridis",
     "image.interpolation": "nearest",
+    "hatch.linewidth": 0.6,
 }
 """Matplotlib settings of all figures, besides Matplotlib's defaults and `KEPT`."""
 KEPT = (
