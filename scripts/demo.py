@@ -36,7 +36,7 @@ START, GOAL, MISSIONS = (9, 0), (0, 9), 8
 HEIGHT, RADIUS = 3.0, 45.0
 RISKY = 0.1
 """Failure probability above which a bound of the first path counts as risky."""
-BOUND = 10
+BOUND = 11
 """Number of the bound of the new path that is drawn in panel (a), from 1."""
 ASPECT = 1.43
 """Width of a panel divided by its height, as for the hillside."""
@@ -101,9 +101,10 @@ def draw(
     right = tb.simulation.KinematicSimulator(workspace)
     known = tb.iterate(workspace, START, GOAL, n_iterations=MISSIONS, simulator=right)
 
-    style = {"font.size": 9, "axes.titlesize": 10, "legend.frameon": False}
+    style = {"font.size": 9, "axes.titlesize": 10, "legend.frameon": False, "hatch.linewidth": 0.6}
     with mpl.rc_context(style):
-        figure, axes = plt.subplots(2, 2, figsize=(8.0, 5.9), layout="constrained")
+        figure, axes = plt.subplots(2, 2, figsize=(8.0, 6.8), layout="constrained")
+        figure.get_layout_engine().set(h_pad=0.08)
         (bound, lost), maps = axes
         draw_bound(bound, result.plan)
         draw_trust(figure, maps, result, center)
@@ -116,7 +117,7 @@ def draw(
         lost.set_ylim(bottom=0.0)
         lost.set_box_aspect(1.0 / ASPECT)
         lost.legend()
-        figure.savefig(file, dpi=150, facecolor="white")
+        figure.savefig(file, dpi=140, facecolor="white")
     print(f"the picture is in {file}")
 
 
@@ -137,7 +138,7 @@ def draw_bound(ax: Axes, plan: tb.planning.Plan) -> None:
     (watches,) = ax.plot(*posts.T, "o", color=ROBOTS[0], markersize=7, markeredgecolor="white")
     seen = np.concatenate([route, posts, *others])
     low, high = seen.min(0) - 2.0, seen.max(0) + 2.0
-    height = 1.75 * max(high[1] - low[1], (high[0] - low[0]) / ASPECT)  # with room for the legend
+    height = 1.4 * max(high[1] - low[1], (high[0] - low[0]) / ASPECT)  # with room for the legend
     x = (low[0] + high[0] - ASPECT * height) / 2.0
     ax.set(xlim=(x, x + ASPECT * height), ylim=(high[1] - height, high[1]))
     ax.set_title("(a) a bound")
@@ -176,8 +177,8 @@ def draw_trust(
         ax.add_patch(circle)
         ax.set(xticks=[], yticks=[], title=title)
         draw_scale(ax)
-    bar = figure.colorbar(image, ax=axes, extend="both", shrink=0.9)
-    bar.set_label("expected trust (1: unbroken contact)\nhatched: never entered, only predicted")
+    bar = figure.colorbar(image, ax=axes, extend="both", location="bottom", aspect=50, shrink=0.7)
+    bar.set_label("expected trust (1: unbroken contact); hatched: never entered, only predicted")
 
 
 def draw_lost(

@@ -79,8 +79,8 @@ def figures() -> Iterator[Figure]:
     yield Figure(
         "trustbo.plots.trust_maps",
         lambda: plots.trust_maps(*maps, workspace, missions=(1, 2)),
-        "Trust maps before mission 1, and after missions 1 and 6, with the next path. The path "
-        "stays the same, but the contact measured on it also changes the trust in other cells.",
+        "Trust maps before mission 1, and after missions 1 and 6, with the next path. The first "
+        "path leads through scrub that is not on the map; the later ones lead around it.",
         wide=True,
     )
     yield Figure(
@@ -91,17 +91,18 @@ def figures() -> Iterator[Figure]:
     )  # fmt: skip
     yield Figure(
         "trustbo.Result.plot_history", lambda: result.plot_history(),
-        "Contact lost in each mission, measured and predicted by the plan.",
+        "Contact lost in each mission, measured and predicted by the plan. The first plan does "
+        "not know of the scrub and of the damage; from mission 3, predictions agree.",
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.plan_map", lambda: plots.plan_map(result.plan, bounds=[1, 2]),
-        "Routes, overwatch points and sight lines of two bounds of the plan.", wide=True,
+        "The path with its overwatch points, and routes and sight lines of two bounds.", wide=True,
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.robot_effects", lambda: plots.robot_effects(robots),
-        "Effect of each robot in each mission, with bars of two standard deviations, which are "
-        "shorter than the markers here. Effects in the grey band hardly change a plan. Filled "
-        "markers show that r2 stands out from the team: it loses contact in all missions.",
+        "Effect of each robot in each mission, with bars of two standard deviations; some are "
+        "shorter than the markers. Effects in the grey band hardly change a plan. Filled markers "
+        "show that r2 stands out from the team: it loses contact in all missions.",
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.cell_map", lambda: plots.cell_map(sd, workspace, path=result.path),
@@ -109,7 +110,7 @@ def figures() -> Iterator[Figure]:
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.grid_map", lambda: plots.grid_map(workspace),
-        "The planning cells with their rows and columns.",
+        "The planning cells with their rows and columns. Grey cells are impassable.",
     )  # fmt: skip
     yield Figure(
         "arviz.plot_forest", forest,
@@ -118,10 +119,10 @@ def figures() -> Iterator[Figure]:
     yield Figure(
         "arviz.plot_ppc_dist", predictions,
         "Posterior predictive check: measured contact rates (black) and predicted ones. The "
-        "default Gaussian family fails this check: 60 % of the measured rates are 1, of its "
-        "predictions 48 % are 1 or more, and predictions exceed 1. The mean, the spread and the "
+        "default Gaussian family fails this check: 36 % of the measured rates are 1, of its "
+        "predictions 20 % are 1 or more, and predictions exceed 1. The mean, the spread and the "
         "smallest rate agree. Plans need the mean of trust only. To predict single rates, use the "
-        'family "censored" with the same effects, which predicts that 62 % are 1.',
+        'family "censored" with the same effects, which predicts that 38 % are 1.',
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.explore",

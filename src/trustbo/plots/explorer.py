@@ -13,6 +13,7 @@ from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
 from trustbo.plots.maps import (
+    COLOURS_OF_SETS,
     extent_of,
     is_good_high,
     is_trust,
@@ -240,13 +241,18 @@ def _looks(layers: dict[str, np.ndarray], maps: xr.Dataset) -> dict[str, Any]:
 
 
 def _draw_plan(plot: Any, plan: Plan) -> None:
-    """Plot the recommended path and, with a terrain, the posts and routes of the robots."""
+    """Plot the recommended path, coloured by sets of posts, and posts and routes on a terrain."""
     from bokeh import models
 
     grid = plan.workspace.grid
     path = _places(plan.path, grid)
     for colour, width in (("black", 5), ("white", 3)):
         plot.line(**path, color=colour, line_width=width, legend_label="recommended")
+    sets = posts_along(plan.path)
+    for i in np.flatnonzero(sets):
+        bound = {axis: places[i : i + 2] for axis, places in path.items()}
+        look = {"color": COLOURS_OF_SETS[sets[i]], "legend_label": f"{POST_SETS[sets[i]]} posts"}
+        plot.line(**bound, line_width=3, **look)
     for k, marker in ((0, "circle"), (-1, "star")):
         look = {"marker": marker, "size": 14, "color": "white", "line_color": "black"}
         plot.scatter([path["x"][k]], [path["y"][k]], **look)
@@ -254,8 +260,8 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
     if plan.posts is None or plan.routes is None:
         return
 
-    sets = [POST_SETS[k] for k in posts_along(plan.path)]
-    of_bounds = {"bound": list(range(1, 1 + len(sets))), "set": sets}
+    names = [POST_SETS[k] for k in sets]
+    of_bounds = {"bound": list(range(1, 1 + len(names))), "set": names}
     drawn = []
     for i, (name, colour, marker) in enumerate(robot_looks(plan.workspace.team.names)):
         x, y = (plan.posts[:, i] - grid.corner).T
@@ -271,7 +277,7 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
         plot.multi_line([r[:, 0] for r in routes], [r[:, 1] for r in routes], **look)
 
     tips = [("robot", "@robot"), ("posts", "@set, bound @bound")]
-    plot.add_tools(models.HoverTool(renderers=drawn, tooltips=tips))
+    plot.add_tools(models.HoverTool(renderers=drawn, tooltips=tips, attachment="above"))
 
 
 def _places(path: Sequence[Station], grid: Grid) -> dict[str, Any]:

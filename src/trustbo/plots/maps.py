@@ -84,7 +84,7 @@ _TICKED = 0.25
 """Distance between ticks at rows and columns, in inches, at least."""
 _HEIGHTS = (2.0, 11.0)
 """Least and largest height of a new figure of the grid, in inches."""
-_OF_SETS = ("white", ROBOTS[5], ROBOTS[4])
+COLOURS_OF_SETS = ("white", ROBOTS[5], ROBOTS[4])
 """Colours of the bounds of a path, by the set of posts from which T2 watches them."""
 
 
@@ -385,7 +385,7 @@ def draw_path(ax: Axes, path: Sequence[Station], grid: Grid) -> None:
     bounds = np.stack([places[:-1], places[1:]], 1)
     sets = posts_along(path)
     for k in np.unique(sets[sets > 0]):
-        style: dict[str, Any] = {"colors": _OF_SETS[k], "label": f"{POST_SETS[k]} posts"}
+        style: dict[str, Any] = {"colors": COLOURS_OF_SETS[k], "label": f"{POST_SETS[k]} posts"}
         ax.add_collection(LineCollection([*bounds[sets == k]], linewidths=2.0, **style))
 
     ax.plot(*places[0], "wo", markeredgecolor="black", markersize=6, label="start")
