@@ -33,7 +33,7 @@ _DASHED = (0, (3, 1.5))
 """Line style of the routes between posts."""
 _HALF = 0.56
 """Half the width of the map of a bound, relative to what it must show."""
-_SMALL = 4.0
+_SMALL = 3.5
 """Size of the posts in the map of the path, in points."""
 _LEAST_HALF = 2.0
 """Half the width of a map that shows a single point, m."""
