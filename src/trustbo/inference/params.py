@@ -39,7 +39,7 @@ _NEXT_MISSION_SEED = 20261123
 """Seed of the next mission's robot effects, so that bands are reproducible."""
 _N_MEAN = 4096
 """Number of draws averaged to compute a prior mean."""
-_ATTRIBUTES = ("family", "model_record")
+_ATTRIBUTES = ("family", "model_record", "robots", "features")
 """Attributes that a posterior must have."""
 _NUMBERED = ("chain", "draw", "mission", "bound")
 """Axes of all posteriors whose labels are numbers."""
@@ -78,7 +78,7 @@ def require_fitted(who: str, value: object) -> xr.DataTree:
     if missing:
         raise TrustboError(
             f"{who} needs a posterior from fit, but this DataTree has no {missing[0]!r}. Give the "
-            "complete result of trustbo.fit."
+            "complete result of trustbo.fit, of this version."
         )
 
     sizes = value["posterior"].sizes
