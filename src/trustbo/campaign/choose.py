@@ -11,6 +11,7 @@ from trustbo.hazard.risk import BoundRisk
 from trustbo.models.draws import Draws
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.policies import Policy, choose_plan
+from trustbo.workspace.moves import by_option
 
 _STOPPED = 2
 """Number of failures after which a bound is avoided."""
@@ -29,7 +30,7 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
 
     A bound that failed twice is avoided unless there is no other path, or its failure probability
     has fallen below 0.2. If failures have a cost, a bound is avoided only if this applies with all
-    of its next moves, because the search accounts for the others by their cost.
+    of its next moves and sets of posts, because the search accounts for the others by their cost.
 
     Before the first failure, the user's slope limit is trusted, and failures have no cost unless
     the user gave `failure_cost`. Under the prior alone, a cost would rule out longer paths that
@@ -42,20 +43,24 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     planner = planner.with_risk(risk)
     problem = planner.problem
     priced = problem.objective.of_contact and problem.failure_cost != 0.0
-    n_stopped = risk.past_failures if priced else risk.past_failures_of_bounds[..., None]
+    n_stopped = risk.past_failures_of_bounds[..., None]
+    if priced:
+        n_stopped = by_option(risk.past_failures)
     stopped = n_stopped + _ROUNDING >= _STOPPED
     if not stopped.any():
         return planner
 
-    is_likely = ~(risk.mean < _RECOVERED)
+    p_fail = by_option(risk.mean)  # (move, row, col, option)
+    exists = by_option(risk.exists)
+    is_likely = ~(p_fail < _RECOVERED)
     if priced:
         stopped &= is_likely
-        avoided = stopped.any(-1) & (stopped | ~risk.exists).all(-1)
+        avoided = stopped.any(-1) & (stopped | ~exists).all(-1)
     else:
-        avoided = stopped.any(-1) & (is_likely & risk.exists).any(-1)
+        avoided = stopped.any(-1) & (is_likely & exists).any(-1)
     if not avoided.any():
         return planner
-    return planner.avoiding(avoided, np.nanmax(risk.mean, axis=-1, initial=0.0))
+    return planner.avoiding(avoided, np.nanmax(p_fail, axis=-1, initial=0.0))
 
 
 def instead_of_failure(planner: Planner, plan: Plan, draws: Draws) -> Plan:

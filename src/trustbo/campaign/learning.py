@@ -212,10 +212,11 @@ def missions_of_hazard(
 def _with_planned_path(mission: Mission, plan: Plan) -> Mission:
     """Add the planned cells to the path of a mission that ends where its log ends.
 
-    The failure probability of a bound depends on the next move, which is then known.
+    The failure probability of a bound depends on the next move and on the set of posts that the
+    plan has for it, which are then known.
     """
     n = len(mission.path)
     is_begun = all(a[:2] == b[:2] for a, b in zip(plan.path, mission.path, strict=False))
     if mission.status == "ok" or len(plan.path) <= n or not is_begun:
         return mission
-    return replace(mission, path=(*mission.path, *plan.path[n:]))
+    return replace(mission, path=(*mission.path[:-1], *plan.path[n - 1 :]))

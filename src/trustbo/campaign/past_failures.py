@@ -12,11 +12,11 @@ import numpy as np
 
 from trustbo.campaign.learning import missions_of_hazard
 from trustbo.campaign.state import State
-from trustbo.data import Cell, Mission, cells_of
+from trustbo.data import POST_SETS, Cell, Mission, Station, cells_of, require_path
 from trustbo.hazard.trials import CAUSES, UNKNOWN, Trials
 from trustbo.planning import Plan, Planner
 from trustbo.planning.plan import PastFailure
-from trustbo.workspace.moves import END, MOVES
+from trustbo.workspace.moves import MOVES
 
 _UNREPORTED = "failed"
 """Status of a mission of an earlier campaign of which only the failed bound is known."""
@@ -36,20 +36,23 @@ def with_past_failures(
     risk = planner.problem.risk
     if risk is None:
         return plan
-    cells = cells_of(plan.path)
-    ends = zip(cells[1:], [*cells[2:], None], strict=True)
-    ahead = [(k, *end) for k, end in enumerate(ends, start=1) if k > plan.n_driven]
+    ahead = range(1 + plan.n_driven, len(plan.path))
+    n_ways = len(MOVES) * planner.workspace.n_posts
 
     found = []
-    for mission, status, (move, row, col, next_move) in _failures(state, so_far):
-        for k, cell, onward in ahead:
-            if cell != (row, col):
+    for mission, status, (before, row, col, after) in _failures(state, planner, so_far):
+        for k in ahead:
+            if plan.path[k][:2] != (row, col):
                 continue
 
-            left = _moved(cell, move, -1)
-            if next_move != UNKNOWN:
-                onward = None if next_move == END else _moved(cell, next_move)
-            way = (left, cell) if onward is None else (left, cell, onward)
+            stations = [_left(before, (row, col))]
+            if after == UNKNOWN:
+                stations += [plan.path[k], *cells_of(plan.path[k + 1 : k + 2])]
+            elif after == n_ways:
+                stations += [(row, col)]
+            else:
+                stations += [(row, col, POST_SETS[after // len(MOVES)]), _moved((row, col), after)]
+            way = require_path("way", stations)
             p_fail = float(risk.along(way).p_fail[0])
             if np.isfinite(p_fail):  # otherwise, the bound is not on the map
                 found.append(PastFailure(k, mission, status, way, p_fail))
@@ -57,40 +60,46 @@ def with_past_failures(
 
 
 def _failures(
-    state: State, so_far: Mission | None
+    state: State, planner: Planner, so_far: Mission | None
 ) -> Iterator[tuple[int | None, str, tuple[int, int, int, int]]]:
     """Yield the mission, the status and the bound of each failure at a known bound.
 
-    The bound is the index of its move, the row and column that it enters, and the index of the next
-    move; see `Trials.bounds`.
+    The bound is its way, the row and column that it enters, and the next way; see `Trials.bounds`.
     """
     goal = tuple(state.settings["goal"])
+    n_posts = planner.workspace.n_posts
     for number, mission in missions_of_hazard(state, so_far):
         cells = cells_of(mission.path)
         bounds = zip(pairwise(cells), mission.statuses, strict=False)
         failed = {ends: status for ends, status in bounds if status in CAUSES}
         if failed:
-            for bound in _failed(Trials.from_missions([mission], goal=goal)):
-                move, row, col, _ = bound
-                left = _moved((row, col), move, -1)
+            for bound in _failed(Trials.from_missions([mission], (), goal, n_posts)):
+                way, row, col, _ = bound
+                left = _left(way, (row, col))[:2]
                 yield number, failed[left, (row, col)], bound
 
     lost = [(_UNREPORTED, mission) for mission in state.earlier.lost]
     lost += [(one.reason, one.lost) for one in state.failures if one.lost is not None]
     for status, mission in lost:
-        for bound in _failed(Trials.from_missions([], [mission])):
+        for bound in _failed(Trials.from_missions([], [mission], n_posts=n_posts)):
             yield None, status, bound
 
 
 def _failed(trials: Trials) -> list[tuple[int, int, int, int]]:
     """Return the bounds that failed."""
     return [
-        (move, row, col, next_move)
-        for move, row, col, next_move in trials.bounds[trials.failed > 0.0].tolist()
+        (way, row, col, after)
+        for way, row, col, after in trials.bounds[trials.failed > 0.0].tolist()
     ]
 
 
-def _moved(cell: Cell, move: int, steps: int = 1) -> Cell:
-    """Return the cell after a number of steps of a move."""
-    down, right = MOVES[move]
+def _left(way: int, entered: Cell) -> Station:
+    """Return the cell that a way leaves, with its set of posts."""
+    number, move = divmod(way, len(MOVES))
+    return *_moved(entered, move, -1), POST_SETS[number]
+
+
+def _moved(cell: Cell, way: int, steps: int = 1) -> Cell:
+    """Return the cell after a number of steps of the move of a way."""
+    down, right = MOVES[way % len(MOVES)]
     return cell[0] + steps * down, cell[1] + steps * right

@@ -8,7 +8,6 @@ import numpy as np
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_share
 from trustbo.planning import InfeasibleError
-from trustbo.workspace.moves import bounds_and_next
 
 Stop = Callable[[Result], str | bool | None]
 """Function called between missions; returning a reason (or True) ends the campaign."""
@@ -34,8 +33,8 @@ class RegretBound:
     contact kept on the best path. For other objectives, regret is a fraction of the best path's
     value. From the third mission on, the campaign stops if two conditions hold: P(regret <= eps) >=
     1 - delta after each of the last two missions, and every bound of the recommended path has been
-    completed at least once. The second condition is needed because the map may be wrong about
-    bounds that no robot has driven.
+    completed at least once, with its sets of posts. The second condition is needed because the map
+    may be wrong about bounds that no robot has driven.
 
     Attributes:
         eps: Acceptable regret, as a fraction; 0.05 is 5 %.
@@ -68,7 +67,7 @@ class RegretBound:
             return None
 
         risk = campaign.risk
-        bounds = tuple(bounds_and_next(np.array(campaign.recommend().path)).T)
+        bounds = tuple(risk.pairs_along(campaign.recommend().path).T)
         was_completed = risk.trials[bounds] > risk.failures[bounds]
         if not was_completed.all():
             return None

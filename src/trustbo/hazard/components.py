@@ -19,7 +19,7 @@ class Components(NamedTuple):
     """Failure probabilities in each group of draws."""
 
     p_fail: np.ndarray
-    """Mean failure probability, shape (component, move, row, col, next_move); NaN where there is no
+    """Mean failure probability, shape (component, way, row, col, next_way); NaN where there is no
     bound."""
     weights: np.ndarray
     """Fraction of the draws in each component, shape (component,); the weights sum to 1."""

@@ -9,12 +9,12 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled
-from trustbo.data import Cell
+from trustbo.data import Station
 from trustbo.display import Rows
 from trustbo.errors import TrustboError, one_line
 from trustbo.hazard.components import Components
 from trustbo.hazard.path_risk import BAND, PathRisk, Risk
-from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES, bounds_and_next
+from trustbo.workspace.moves import MOVES, next_names, way_names
 
 _WEIGHT_ROUNDING = 1e-6
 """Tolerance for rounding errors in the sum of the weights of components."""
@@ -25,9 +25,9 @@ class GivenRisk(Risk):
     """Given probability that each bound of a workspace ends the mission.
 
     Attributes:
-        p_fail: Posterior mean, shape (move, row, col, next_move), with moves as in `MOVES`. The
-            last next move is the end of the path. `p_fail` is NaN where there is no bound.
-        draws: Posterior draws, shape (draw, move, row, col, next_move), or None.
+        p_fail: Posterior mean, shape (way, row, col, next_way); see `workspace.moves`. The last
+            next way is the end of the path. `p_fail` is NaN where there is no bound.
+        draws: Posterior draws, shape (draw, way, row, col, next_way), or None.
         components: Mean failure probabilities of groups of draws, used for the failure probability
             of a path. If None, bounds are assumed to fail independently with probability `p_fail`.
 
@@ -87,14 +87,14 @@ class GivenRisk(Risk):
         """Components with which paths are searched; by default, bounds fail independently."""
         return self.components or Components(self.p_fail[None], np.ones(1))
 
-    def along(self, path: Sequence[Cell] | np.ndarray) -> PathRisk:
+    def along(self, path: Sequence[Station] | np.ndarray) -> PathRisk:
         """Compute the risk along a path.
 
         Without draws, the arrival probability is the product of the means 1 - p_fail. With draws,
         this product is multiplied by the ratio of the mean of the product to the product of the
         means, both over the draws, because failures are correlated.
         """
-        index = tuple(bounds_and_next(path).T)
+        index = tuple(self.pairs_along(path).T)
         p = self.p_fail[index]
         reach = np.cumprod(1.0 - p)
         if self.draws is None:
@@ -113,23 +113,41 @@ class GivenRisk(Risk):
         return PathRisk(p, float(reach[-1]), (low, high))
 
 
-def read_risk(what: str, values: ArrayLike, leading: Sequence[str] = ()) -> np.ndarray:
-    """Read probabilities of bounds with their next moves, (..., move, row, col, next_move).
+def read_risk(
+    what: str, values: ArrayLike, leading: Sequence[str] = (), n_posts: int = 1
+) -> np.ndarray:
+    """Read probabilities of bounds with their next ways, (..., way, row, col, next_way).
 
     Args:
         what: Name of the argument in messages.
-        values: Array of this shape; or without the axis of next moves, which then do not matter. A
-            DataArray is read by its dims and labels.
+        values: Array of this shape; or without the axis of next ways, which then do not matter. If
+            the ways or the next ways are the eight moves, the probabilities hold for all sets of
+            posts. A DataArray is read by its dims, `move` and `next_move`, and its labels.
         leading: Names of the leading axes.
+        n_posts: Number of sets of posts.
 
     Raises:
         TrustboError: If the dims or labels are wrong.
     """
-    dims = *leading, "move", "row", "col"
-    labels = {"move": MOVE_NAMES, "next_move": NEXT_NAMES}
-    n_dims = len(values.dims) if isinstance(values, xr.DataArray) else np.ndim(values)
-    if n_dims > len(dims):
-        return read_labelled(what, values, (*dims, "next_move"), labels).values
+    dims = *leading, "move", "row", "col", "next_move"
+    is_labelled = isinstance(values, xr.DataArray)
+    sizes = dict(values.sizes if is_labelled else zip(dims, np.shape(values), strict=False))
+    by_next = len(sizes) == len(dims)
 
-    maps = read_labelled(what, values, dims, labels).values
-    return np.broadcast_to(maps[..., None], (*maps.shape, len(NEXT_NAMES)))
+    n_ways = len(MOVES) * n_posts
+    for_all = sizes.get("move") == len(MOVES)
+    next_for_all = sizes.get("next_move") == len(MOVES) + 1
+    labels = {
+        "move": way_names(1 if for_all else n_posts),
+        "next_move": next_names(1 if next_for_all else n_posts),
+    }
+    maps = read_labelled(what, values, dims if by_next else dims[:-1], labels).values
+
+    if not by_next:
+        maps = np.broadcast_to(maps[..., None], (*maps.shape, n_ways + 1))
+    elif next_for_all:
+        after = np.append(np.arange(n_ways) % len(MOVES), len(MOVES))
+        maps = maps[..., after]
+    if for_all:
+        maps = np.take(maps, np.arange(n_ways) % len(MOVES), axis=len(leading))
+    return maps

@@ -1,9 +1,10 @@
 """Hazard model: the probability that a bound ends the mission, inferred from missions.
 
-Bound e, together with its next move, fails with probability p_e ~ Beta(s m_e, s (1 - m_e)). Next
-moves with the same steepest route share one p_e (see `workspace.difficulty`). The prior mean m_e
-depends on the difficulties of the robots' routes and on t_e, the number of degrees by which the
-tilt of the steepest route exceeds the slope limit:
+Bound e, together with its next move and the sets of posts before both moves, fails with probability
+p_e ~ Beta(s m_e, s (1 - m_e)). In a bound, next moves and sets with the same steepest route share
+one p_e (see `workspace.difficulty`). The prior mean m_e depends on the difficulties of the robots'
+routes and on t_e, the number of degrees by which the tilt of the steepest route exceeds the slope
+limit:
 
     1 - m_e = sigma(-logit_e) sigma(-(t_e + margin) / width),
     logit_e = intercept + sum_j coefficient_j (difficulty_ej - 1/2).
@@ -32,7 +33,7 @@ from trustbo.parallel import computing
 from trustbo.stacking import list_of_missions
 from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import TILT
-from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES
+from trustbo.workspace.moves import next_names, way_names
 
 _ROUND = 1024
 """Number of points of importance sampling per round."""
@@ -87,8 +88,10 @@ def fit_hazard(
         each mission lost at an unknown place failed. `trials` and `failures` (move, row, col,
         next_move) count known outcomes of a bound that is followed by a given next move or by the
         end of the path; a failure whose next move is unknown, because the robots turned back or the
-        log ends, is shared equally by all next moves. `is_bound` (move, row, col) says which bounds
-        exist. `BoundRisk` computes the failure probabilities of all bounds from this group.
+        log ends, is shared equally by all next moves. With several sets of posts, moves and next
+        moves are named "ne" with the standard set, "ne far", ... `is_bound` (move, row, col) says
+        which bounds exist. `BoundRisk` computes the failure probabilities of all bounds from this
+        group.
 
     Raises:
         TrustboError: If a mission has no map or is on another map (see `Mission.map`), or if its
@@ -110,7 +113,8 @@ def fit_hazard(
                 "it out."
             )
 
-    trials = Trials.from_missions(missions, lost, goal)
+    n_posts = workspace.n_posts
+    trials = Trials.from_missions(missions, lost, goal, n_posts)
     difficulty = workspace.difficulty
     shape = difficulty.exists.shape[1:3]
     cells = trials.bounds[:, 1:3]
@@ -119,12 +123,10 @@ def fit_hazard(
         cell = tuple(cells[outside][0].tolist())
         raise TrustboError(f"a mission enters {cell}, outside the workspace of shape {shape}.")
 
-    unit = np.full(difficulty.exists.shape, -1)  # of the attempted bounds only
-    unit[*trials.bounds.T[:3]] = difficulty.of(trials.bounds[:, :3]).unit
-    trials = trials.with_known_next(unit)
+    trials = trials.with_known_next(difficulty.exists)
+    units = trials.of_units(difficulty.units_of(trials.bounds))
 
     # A bound that the robots drove, but that does not exist on the map, has the largest difficulty.
-    units = trials.of_units(unit)
     measured = difficulty.of(units.bounds[:, :3]).values
     met = np.nan_to_num(measured[np.arange(len(measured)), units.bounds[:, 3]], nan=1.0)
     names = difficulty.measures
@@ -133,7 +135,7 @@ def fit_hazard(
     points, places = sample(prior, units, rng)
 
     weighted = [name for name in names if name != TILT]
-    group = _to_dataset(prior, trials, points, places, weighted, difficulty.exists, seed)
+    group = _to_dataset(prior, trials, points, places, weighted, difficulty.exists, seed, n_posts)
     k_hat = float(np.clip(points.k_hat, -1.0, _LARGEST_KHAT))
     group.attrs = {"k_hat": k_hat, "kish": points.kish, "seed": seed}
     group.attrs |= {f"prior_{name}": list(value) for name, value in asdict(hazard).items()}
@@ -299,11 +301,12 @@ def _to_dataset(
     measures: Sequence[str],
     exists: np.ndarray,
     seed: int,
+    n_posts: int,
 ) -> xr.Dataset:
     """Make the group `hazard` without attributes.
 
     `measures` are the names of the measures that have weights, and `exists` says which bounds
-    exist, shape (move, row, col, next_move).
+    exist, shape (way, row, col, next_way).
     """
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(points.resample(_N_DRAWS, rng))
@@ -341,7 +344,7 @@ def _to_dataset(
             "draw": np.arange(_N_DRAWS),
             "measure": list(measures),
             "axis": list(_MAPS),
-            "move": list(MOVE_NAMES),
-            "next_move": list(NEXT_NAMES),
+            "move": way_names(n_posts),
+            "next_move": next_names(n_posts),
         },
     )

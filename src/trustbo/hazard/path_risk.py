@@ -7,10 +7,10 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from trustbo.data import Cell
+from trustbo.data import Station
 from trustbo.display import Rows, Summary
 from trustbo.hazard.components import Components
-from trustbo.workspace.moves import bounds_and_next
+from trustbo.workspace.moves import MOVES, pairs_along
 
 ROUNDING = 1e-12
 """Tolerance for rounding errors when the risk of a path is compared with its limit."""
@@ -42,15 +42,15 @@ class PathRisk(NamedTuple):
 class Risk(Summary, ABC):
     """Probability that each bound of a workspace ends the mission.
 
-    Maps have shape (move, row, col, next_move), where (row, col) is the cell that a bound enters.
-    Moves are ordered as in `MOVES`, and the last next move is the end of the path. Failure
-    probabilities are NaN where there is no bound.
+    Maps have shape (way, row, col, next_way), where (row, col) is the cell that a bound enters. A
+    way is a move of `MOVES` or, with several sets of posts, move + 8 set; see `workspace.moves`.
+    The last next way is the end of the path. Failure probabilities are NaN where there is no bound.
     """
 
     @cached_property
     @abstractmethod
     def mean(self) -> np.ndarray:
-        """Mean of the failure probability, shape (move, row, col, next_move)."""
+        """Mean of the failure probability, shape (way, row, col, next_way)."""
 
     @property
     @abstractmethod
@@ -63,24 +63,28 @@ class Risk(Summary, ABC):
         """Components with which paths are searched."""
 
     @abstractmethod
-    def along(self, path: Sequence[Cell] | np.ndarray) -> PathRisk:
+    def along(self, path: Sequence[Station] | np.ndarray) -> PathRisk:
         """Compute the risk along a path."""
 
     @property
     def of_bounds(self) -> np.ndarray:
-        """Failure probability of each bound, shape (move, row, col), averaged over next moves."""
+        """Failure probability of each bound, shape (way, row, col), averaged over next ways."""
         known = np.isfinite(self.mean)
         total = np.where(known, self.mean, 0.0).sum(-1)
         return np.where(known.any(-1), total / np.maximum(known.sum(-1), 1), np.nan)
 
-    def failure(self, path: Sequence[Cell] | np.ndarray) -> float:
+    def pairs_along(self, path: Sequence[Station] | np.ndarray) -> np.ndarray:
+        """Return the indices in the maps of the bounds of a path, shape (bound, 4)."""
+        return pairs_along(path, self.shape[0] // len(MOVES))
+
+    def failure(self, path: Sequence[Station] | np.ndarray) -> float:
         """Compute the failure probability of a path, for `failure_cost` and `max_failure`.
 
         It is averaged over the components, as in a search, because failures of bounds are
         correlated; see `along` for the exact mean.
         """
         p_fail, weights = self.searched
-        index = bounds_and_next(path).T
+        index = self.pairs_along(path).T
         return float(weights @ (1.0 - np.prod(1.0 - p_fail[:, *index], axis=1)))
 
     def _rows_of_failures(self) -> Rows:

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.arrays import in_order
-from trustbo.data import Cell
+from trustbo.data import Station
 from trustbo.display import Rows
 from trustbo.errors import TrustboError, require_whole
 from trustbo.hazard.components import Components, partition
@@ -16,12 +16,10 @@ from trustbo.hazard.path_risk import BAND, PathRisk, Risk
 from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, prior_betas, steepness_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.difficulty import TILT
-from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES, bounds_and_next
+from trustbo.workspace.moves import by_option, by_way, next_names, way_names
 
 _DIMS = ("draw", "lost", "measure", "bound", "axis", "move", "row", "col", "next_move")
 """Axes of the group `hazard`, in order."""
-_LABELS = {"draw": None, "axis": _DIMS[-4:], "move": MOVE_NAMES, "next_move": NEXT_NAMES}
-"""Labels of its axes, in order; None for numbers."""
 _ENTRIES = 1 << 20
 """Maximum size of an array (draw, bound)."""
 _SOME = 256
@@ -31,16 +29,16 @@ _SOME = 256
 class BoundRisk(Risk):
     """Posterior of the probability that each bound of a workspace ends the mission.
 
-    Maps have shape (move, row, col, next_move), where (row, col) is the cell that a bound enters.
-    Moves are ordered as in `MOVES`, and the last next move is the end of the path. Failure
-    probabilities are NaN where there is no bound.
+    Maps have shape (way, row, col, next_way), where (row, col) is the cell that a bound enters. A
+    way is a move of `MOVES` or, with several sets of posts, move + 8 set; see `workspace.moves`.
+    The last next way is the end of the path. Failure probabilities are NaN where there is no bound.
 
     Attributes:
-        exists: Whether each bound exists and can be followed by the next move, shape (move, row,
-            col, next_move).
+        exists: Whether each bound exists and can be followed by the next way, shape (way, row, col,
+            next_way).
         trials: Number of times that each bound is known to have been completed or to have failed,
-            shape (move, row, col, next_move).
-        failures: Number of failures at a known bound, shape (move, row, col, next_move).
+            shape (way, row, col, next_way).
+        failures: Number of failures at a known bound, shape (way, row, col, next_way).
 
     The risk of a path needs the difficulty of its bounds only. Maps need that of all bounds, which
     is measured when a map is first computed.
@@ -59,7 +57,13 @@ class BoundRisk(Risk):
         """
         difficulty = workspace.difficulty
         shape = difficulty.exists.shape
-        hazard = in_order("the hazard posterior", hazard, _LABELS)
+        labels = {
+            "draw": None,  # numbers
+            "axis": _DIMS[-4:],
+            "move": way_names(workspace.n_posts),
+            "next_move": next_names(workspace.n_posts),
+        }
+        hazard = in_order("the hazard posterior", hazard, labels)
         hazard = hazard.transpose(*_DIMS, missing_dims="ignore")
         if hazard["trials"].shape != shape:
             raise TrustboError(
@@ -85,7 +89,9 @@ class BoundRisk(Risk):
 
         self.trials = hazard["trials"].values
         self.failures = hazard["failures"].values
+        self._counts = by_option(self.failures), by_option(self.trials)
         self._difficulty = difficulty
+        self._n_posts = workspace.n_posts
         self._measures = [difficulty.measures.index(name) for name in names]
         self._max_slope = workspace.team.max_slope
 
@@ -99,6 +105,7 @@ class BoundRisk(Risk):
         of_draws = [hazard[name].values for name in limit]
         self._limit = np.reshape(of_draws, (len(limit), len(self._strength))).T
 
+        # Ways and next ways of each lost mission, (bound, 4).
         self._lost = [path[path[:, 0] >= 0] for path in hazard["lost_bound"].values]
         self._place = hazard["place"].values  # (draw, lost), from 1
 
@@ -126,7 +133,7 @@ class BoundRisk(Risk):
     def steepness(self) -> np.ndarray | None:
         """Degrees by which each bound exceeds the stated slope limit; None without a limit.
 
-        The shape is (move, row, col, next_move).
+        The shape is (way, row, col, next_way).
         """
         if not self._has_limit:
             return None
@@ -138,34 +145,39 @@ class BoundRisk(Risk):
         return steepness_of(tilt, self._max_slope)
 
     @cached_property
+    def _unit(self) -> np.ndarray:
+        """First option of each option's unit, shape (move, row, col, option); -1 if none."""
+        return by_option(self._difficulty.whole().unit)
+
+    @cached_property
     def _units(self) -> np.ndarray:
-        """All units as bounds with their first next move, shape (unit, 4)."""
-        unit = self._difficulty.whole().unit
-        return np.argwhere(unit == np.arange(unit.shape[-1]))
+        """All units as bounds with their first option, shape (unit, 4)."""
+        return np.argwhere(self._unit == np.arange(self._unit.shape[-1]))
 
     @cached_property
     def _number(self) -> np.ndarray:
-        """Index of each bound's unit in `_units`, (move, row, col, next_move); -1 if none."""
-        first = self._difficulty.whole().unit
+        """Index of each option's unit in `_units`, (move, row, col, option); -1 if none."""
+        first = self._unit
         number = np.full(first.shape, -1)
         number[*self._units.T] = np.arange(len(self._units))
         of_first = np.take_along_axis(number, np.maximum(first, 0), -1)
         return np.where(first >= 0, of_first, -1)
 
     def _maps(self, values: np.ndarray) -> np.ndarray:
-        """Return values (..., unit) as maps (..., move, row, col, next_move)."""
+        """Return values (..., unit) as maps (..., way, row, col, next_way)."""
         nowhere = np.full((*values.shape[:-1], 1), np.nan)
         values = np.concatenate([values, nowhere], axis=-1)
 
         of_bounds = self._number.max(-1)
-        if ((self._number == of_bounds[..., None]) | ~self.exists).all():  # as without a terrain
+        if ((self._number == of_bounds[..., None]) | (self._unit < 0)).all():  # without a terrain
             maps = values[..., of_bounds]
-            return np.broadcast_to(maps[..., None], (*maps.shape, self._number.shape[-1]))
-        return values[..., self._number]
+            maps = np.broadcast_to(maps[..., None], (*maps.shape, self._number.shape[-1]))
+            return by_way(maps, self._n_posts)
+        return values[..., by_way(self._number, self._n_posts)]
 
     @cached_property
     def mean(self) -> np.ndarray:
-        """Posterior mean of the failure probability, shape (move, row, col, next_move)."""
+        """Posterior mean of the failure probability, shape (way, row, col, next_way)."""
         mean = np.empty(len(self._units))
         for units, a, b in self._betas():
             mean[units] = (a / (a + b)).mean(0)
@@ -178,46 +190,39 @@ class BoundRisk(Risk):
 
     @cached_property
     def past_failures(self) -> np.ndarray:
-        """Posterior mean of the number of past failures, shape (move, row, col, next_move).
+        """Posterior mean of the number of past failures, shape (way, row, col, next_way).
 
-        Next moves with the same steepest route share their failures.
+        Next ways, and sets of posts, with the same steepest route share their failures.
         """
         counts = self.failures.copy()
         for j, path in enumerate(self._lost):
             for k, bound in enumerate(path, start=1):
                 counts[*bound] += (self._place[:, j] == k).mean()
 
+        counts = by_option(counts)
         stopped = np.zeros(counts.shape)
         bounds = np.argwhere(counts.any(-1))
-        same = self._same_unit(bounds)
+        unit = self._difficulty.of(bounds).unit
+        same = (unit[..., None] == unit[:, None, :]) & (unit >= 0)[..., None]
         stopped[*bounds.T] = np.where(same, counts[*bounds.T][:, None, :], 0.0).sum(-1)
-        return stopped
+        return by_way(stopped, self._n_posts)
 
     @cached_property
     def past_failures_of_bounds(self) -> np.ndarray:
-        """Posterior mean of the number of past failures of each bound, shape (move, row, col)."""
-        bounds = np.argwhere(self.past_failures.any(-1))
+        """Posterior mean of the number of past failures of each bound, shape (move, row, col).
+
+        With several sets of posts, a bound counts the failures with all of them.
+        """
+        failures = by_option(self.past_failures)
+        bounds = np.argwhere(failures.any(-1))
         unit = self._difficulty.of(bounds).unit
         is_first = unit == np.arange(unit.shape[-1])
-        stopped = np.zeros(self.past_failures.shape[:-1])
-        stopped[*bounds.T] = np.where(is_first, self.past_failures[*bounds.T], 0.0).sum(-1)
+        stopped = np.zeros(failures.shape[:-1])
+        stopped[*bounds.T] = np.where(is_first, failures[*bounds.T], 0.0).sum(-1)
         return stopped
 
-    def _same_unit(self, bounds: np.ndarray) -> np.ndarray:
-        """Return which next moves of bounds (bound, 3) are one unit, (bound, next_move, next_move).
-
-        Next moves that do not exist are in no unit.
-        """
-        unit = self._difficulty.of(bounds).unit
-        return (unit[..., None] == unit[:, None, :]) & (unit >= 0)[..., None]
-
-    def _units_at(self, bounds: np.ndarray) -> np.ndarray:
-        """Replace the next moves of bounds (bound, 4) by the first of their unit, -1 if none."""
-        unit = self._difficulty.of(bounds[:, :3]).unit
-        return np.column_stack([bounds[:, :3], unit[np.arange(len(bounds)), bounds[:, 3]]])
-
     def draw(self, n: int, seed: int = 0) -> np.ndarray:
-        """Draw the failure probabilities, shape (draw, move, row, col, next_move).
+        """Draw the failure probabilities, shape (draw, way, row, col, next_way).
 
         Args:
             n: Number of draws. The hyperparameter draws are evenly spaced in order of severity, so
@@ -258,17 +263,17 @@ class BoundRisk(Risk):
         """Components with which paths are searched."""
         return self.components()
 
-    def along(self, path: Sequence[Cell] | np.ndarray) -> PathRisk:
+    def along(self, path: Sequence[Station] | np.ndarray) -> PathRisk:
         """Compute the risk along a path, without the risk of other bounds.
 
         Given the hyperparameters, units fail independently, with probabilities that have Beta
         distributions. The arrival probability is averaged over the draws of the hyperparameters.
         Probabilities of bounds that do not exist are NaN, and so is the arrival probability.
         """
-        of_bounds = self._units_at(bounds_and_next(path))
-        units, index = np.unique(of_bounds, axis=0, return_inverse=True)
+        pairs = self.pairs_along(path)
+        units, index = np.unique(self._difficulty.units_of(pairs), axis=0, return_inverse=True)
         a, b = self._betas_of(units)
-        exists = of_bounds[:, 3] >= 0
+        exists = self.exists[*pairs.T]
         p_fail = np.where(exists, (a / (a + b)).mean(0)[index], np.nan)
         if not exists.all():
             return PathRisk(p_fail, np.nan, (np.nan, np.nan))
@@ -304,11 +309,12 @@ class BoundRisk(Risk):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return alpha and beta (draw, unit) of the posterior Beta distributions of units.
 
-        Units (unit, 4) are distinct bounds with the first next move of the unit.
+        Units (unit, 4) are distinct bounds with the first option of the unit.
         """
         bounds = units[:, :3]
         of_unit = np.arange(len(units)), units[:, 3]
-        measures = self._difficulty.of(bounds).values[of_unit]
+        difficulty = self._difficulty.of(bounds)
+        measures = difficulty.values[of_unit]
         a, b = prior_betas(
             self._weights[draws],
             self._limit[draws],
@@ -317,17 +323,17 @@ class BoundRisk(Risk):
             self._steepness_of(measures) if self._has_limit else None,
         )
 
-        member = self._same_unit(bounds)[of_unit]  # (unit, next_move)
+        member = difficulty.unit == units[:, 3:]  # (unit, option)
         failed, trials = (
-            np.where(member, counts[*bounds.T], 0.0).sum(-1)
-            for counts in (self.failures, self.trials)
+            np.where(member, counts[*bounds.T], 0.0).sum(-1) for counts in self._counts
         )
         a += failed
         b += trials - failed
 
-        position = {bound: k for k, bound in enumerate(map(tuple, units.tolist()))}
+        position = {unit: k for k, unit in enumerate(map(tuple, units.tolist()))}
         for j, path in enumerate(self._lost):
-            at = [position.get(bound, -1) for bound in map(tuple, self._units_at(path).tolist())]
+            of_path = self._difficulty.units_of(path)
+            at = [position.get(unit, -1) for unit in map(tuple, of_path.tolist())]
             add_lost(np.array(at), self._place[draws, j] - 1, a, b)
         return a, b
 

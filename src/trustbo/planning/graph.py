@@ -46,7 +46,7 @@ def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph | nx.MultiDiGraph:
         "cost": cost,
     }
     if problem.risk is not None:
-        values["risk"] = of_bounds(np.tile(risk_of(problem.risk.of_bounds), (n_posts, 1, 1)))
+        values["risk"] = of_bounds(risk_of(problem.risk.of_bounds))
 
     graph = nx.DiGraph(constant=constant) if n_posts == 1 else nx.MultiDiGraph(constant=constant)
     for row, col in np.argwhere(workspace.passable.values).tolist():

@@ -210,14 +210,14 @@ class AdmissiblePaths:
         graph = self.graph
         self._require_size(len(graph.head))  # every edge becomes a state
         n_cells = self.bounds[0].size
-        if self.workspace.n_posts == 1:
-            return committed(graph, n_cells, None)
-
         n_ways = len(self.bounds) * self.workspace.n_posts
+        if self.workspace.n_posts == 1:
+            return committed(graph, n_cells, n_ways, None)
+
         number = np.full((n_ways, n_cells, n_ways + 1), -1, np.int32)
         way, row, col, after = self.pairs.T
         number[way, row * self.bounds.shape[2] + col, after] = np.arange(len(way))
-        return committed(graph, n_cells, number)
+        return committed(graph, n_cells, n_ways, number)
 
     @cached_property
     def pairs(self) -> np.ndarray:
@@ -225,11 +225,7 @@ class AdmissiblePaths:
 
         The next way is the number of ways at the end of a path.
         """
-        n_posts = self.workspace.n_posts
-        follows = possible_next(self.bounds)  # (move, row, col, next_move)
-        onward = np.tile(follows[..., :-1], (n_posts, 1, 1, n_posts))
-        ends = np.tile(follows[..., -1:], (n_posts, 1, 1, 1))
-        return np.argwhere(np.concatenate([onward, ends], axis=-1))
+        return np.argwhere(possible_next(self.bounds, self.workspace.n_posts))
 
     @cached_property
     def awareness_of_pairs(self) -> np.ndarray:

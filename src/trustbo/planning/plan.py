@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import pandas as pd
 
-from trustbo.data import POST_SETS, Cell, Station, path_text
+from trustbo.data import POST_SETS, Cell, Station, cells_of, path_text
 from trustbo.display import Rows, Summary, joined
 from trustbo.hazard.path_risk import PathRisk
 from trustbo.workspace import Workspace
@@ -24,8 +24,9 @@ _ROUNDING = 1e-9  # relative; the draws of a path and of a single bound are aver
 class PastFailure(NamedTuple):
     """Failure of a past mission in a bound into a cell that a plan enters.
 
-    A failure counts for the bound that failed, followed by the same next move. A plan may therefore
-    enter the same cell from another side, or leave it in another direction.
+    A failure counts for the bound that failed, followed by the same next move, with the same sets
+    of posts. A plan may therefore enter the same cell from another side, leave it in another
+    direction, or have other posts.
     """
 
     bound: int
@@ -34,9 +35,10 @@ class PastFailure(NamedTuple):
     """Number of the mission that failed; None if it has none, as after `Campaign.fail`."""
     status: str
     """Status of the bound that failed, such as "tipped"."""
-    way: tuple[Cell, ...]
-    """The cell left and the cell entered in the bound that failed, and the cell after them, if any.
-    If the planned next move is not known, the cell after them is that of the plan."""
+    way: tuple[Station, ...]
+    """The cell left and the cell entered in the bound that failed, and the cell after them, if any,
+    with the sets of posts as in `Plan.path`. If the planned next move is not known, the cell after
+    them is that of the plan."""
     p_fail: float
     """Posterior mean probability that a bound on this way fails; compare `Plan.p_fail`."""
 
@@ -253,7 +255,7 @@ def past_failures_of(plan: Plan) -> list[str]:
     ways: dict[int, dict[Any, list[PastFailure]]] = {}
     for failure in plan.past_failures:
         k = failure.bound
-        same = failure.way[0] == plan.path[k - 1][:2] and math.isclose(
+        same = failure.way[0][:2] == plan.path[k - 1][:2] and math.isclose(
             failure.p_fail, p_fail[k - 1], rel_tol=_ROUNDING
         )
         way = None if same else (failure.way, failure.p_fail)
@@ -261,11 +263,15 @@ def past_failures_of(plan: Plan) -> list[str]:
 
     texts = []
     for k, of_bound in ways.items():
-        left, entered = (cell[:2] for cell in plan.path[k - 1 : k + 1])
+        left, entered = cells_of(plan.path[k - 1 : k + 1])
         text = f"bound {k} enters {path_text([entered])} from {path_text([left])} with failure "
         text += f"probability {p_fail[k - 1]:.2g}{_when(of_bound.pop(None))}"
         for (way, failed), failures in of_bound.items():
-            side = "before another next move" if way[0] == left else f"from {path_text(way[:1])}"
+            failed_left, _, *after = cells_of(way)
+            side = f"from {path_text([failed_left])}"
+            if failed_left == left:
+                same_next = after == cells_of(plan.path[k + 1 : k + 2])
+                side = "with other posts" if same_next else "before another next move"
             text += f"; {side}, it is {failed:.2g}{_when(failures)}"
         texts.append(text)
     return texts

@@ -224,7 +224,8 @@ class Planner(Summary):
         Args:
             p_fail: A `BoundRisk`, without other arguments. Or posterior means of the shape (move,
                 row, col, next_move), where the last next move is the end of the path, or (move,
-                row, col) if the next move does not matter; NaN where there is no bound.
+                row, col) if the next move does not matter; NaN where there is no bound. They hold
+                for all sets of posts, unless the axes are the ways of `Workspace.awareness`.
             draws: Posterior draws, with a leading axis (draw,), for `p_arrive` and its 90 % band.
             components: Mean failure probabilities of groups of draws, with a leading axis
                 (component,), such as `BoundRisk.components()`. They are used for the expected cost
@@ -239,10 +240,11 @@ class Planner(Summary):
                 raise TrustboError("give a BoundRisk without draws= and components=; it has both.")
             return self._with(risk=p_fail)
 
-        mean = read_risk("p_fail", p_fail)
-        drawn = None if draws is None else read_risk("draws", draws, ("draw",))
+        n_posts = self.workspace.n_posts
+        mean = read_risk("p_fail", p_fail, (), n_posts)
+        drawn = None if draws is None else read_risk("draws", draws, ("draw",), n_posts)
         if components is not None:
-            groups = read_risk("components", components.p_fail, ("component",))
+            groups = read_risk("components", components.p_fail, ("component",), n_posts)
             components = components._replace(p_fail=groups)
         return self._with(risk=GivenRisk(mean, drawn, components))
 
@@ -392,7 +394,7 @@ class Planner(Summary):
         - `lost`: contact lost at this trust, in bounds, plus the bound cost.
         - `cost`: amount by which the bound reduces the objective at this trust; see below.
         - `risk`: -log(1 - p), if the planner has a risk, where p is the failure probability of the
-          bound, averaged over the next moves.
+          bound, averaged over the next moves and their sets of posts.
 
         The algorithms of networkx minimise a sum over edges. If beta0 is 0, trust is not carried
         over, and the sum of `cost` along a path to the goal gives its value:

@@ -25,11 +25,12 @@ from trustbo.planning.sums import best_sums
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import (
     END,
-    MOVE_NAMES,
-    NEXT_NAMES,
-    bounds_and_next,
+    cells_along,
+    moves_along,
+    next_names,
     pairs_along,
     possible_next,
+    way_names,
 )
 
 EXACT = 1e-12
@@ -76,7 +77,8 @@ class Problem:
         max_failure: Largest failure probability allowed for a path, or None for no limit.
         failure_cost: Cost of a failure in bounds, or None for the smallest number of bounds of a
             path.
-        risk: Failure probability of each bound, or None if the planner has no risk.
+        risk: Failure probability of each bound, by way and next way, or None if the planner has no
+            risk.
         x0: Expected trust at the start, shape (robot,), or None for `x0_mean` of the parameters.
     """
 
@@ -103,7 +105,8 @@ class Problem:
                     f"{self.objective.name!r} does not measure contact; use max_failure instead."
                 )
 
-        shape = (*self.paths.bounds.shape, END + 1)
+        n_ways = len(self.paths.bounds) * self.paths.workspace.n_posts
+        shape = (n_ways, *self.paths.bounds.shape[1:], n_ways + 1)
         if self.risk is not None and self.risk.shape != shape:
             raise TrustboError(f"p_fail must have the shape {shape}; got {self.risk.shape}.")
 
@@ -148,7 +151,7 @@ class Problem:
 
     def bound_cost_along(self, path: Sequence[Station] | np.ndarray) -> float:
         """Sum the costs of the bounds of a path."""
-        return float(self.bound_cost[*bounds_and_next(path).T[:3]].sum())
+        return float(self.bound_cost[moves_along(path), *cells_along(path)[1:].T].sum())
 
     def value_along(self, bound_cost: float, trust: np.ndarray, noise_sd: np.ndarray) -> np.ndarray:
         """Compute the value of a path, shape (...,), assuming that no bound fails.
@@ -190,7 +193,7 @@ class Problem:
         if self.objective.of_contact:
             if self.risk is None:
                 return lost, 0.0
-            p_fail = np.tile(np.nan_to_num(self.risk.of_bounds), (n_posts, 1, 1))
+            p_fail = np.nan_to_num(self.risk.of_bounds)
             return lost + self.cost_of_failure * p_fail[bounds], 0.0
 
         bound_cost = np.tile(self.bound_cost, (n_posts, 1, 1))[bounds]
@@ -263,13 +266,14 @@ class Problem:
             return None
 
         p_fail, weights = self.risk.searched
-        missing = np.isnan(p_fail).any(0) & possible_next(self.paths.bounds)
+        n_posts = self.paths.workspace.n_posts
+        missing = np.isnan(p_fail).any(0) & possible_next(self.paths.bounds, n_posts)
         if missing.any():
-            move, row, col, after = np.argwhere(missing)[0].tolist()
+            way, row, col, after = np.argwhere(missing)[0].tolist()
             raise TrustboError(
                 f"p_fail is NaN for the bound that enters {(row, col)} by the move "
-                f"{MOVE_NAMES[move]!r}, followed by {NEXT_NAMES[after]!r}; give a probability for "
-                "every possible bound."
+                f"{way_names(n_posts)[way]!r}, followed by {next_names(n_posts)[after]!r}; give a "
+                "probability for every possible bound."
             )
 
         limit = np.inf if self.max_failure is None else self.max_failure + ROUNDING
@@ -421,10 +425,10 @@ def risk_of(p_fail: np.ndarray) -> np.ndarray:
 
 
 def risks_by_bound(p_fail: np.ndarray) -> np.ndarray:
-    """Compute risks (bound, component); a bound is a flat index into (move, row, col, next_move).
+    """Compute risks (bound, component); a bound is a flat index into (way, row, col, next_way).
 
     Args:
-        p_fail: Failure probabilities, shape (component, move, row, col, next_move).
+        p_fail: Failure probabilities, shape (component, way, row, col, next_way).
     """
     return np.ascontiguousarray(risk_of(p_fail).reshape(len(p_fail), -1).T)
 

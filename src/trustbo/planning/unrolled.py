@@ -56,21 +56,22 @@ class Committed(NamedTuple):
 
     Attributes:
         graph: Unrolled graph; its attribute `turns` is True, as no search has to exclude U-turns.
-        risk: Flat index into (move, row, col, next_move) of the bound of each edge, shape (edge,).
+        risk: Flat index into (way, row, col, next_way) of the bound of each edge, shape (edge,).
     """
 
     graph: Unrolled
     risk: np.ndarray
 
 
-def committed(graph: Unrolled, n_cells: int, number: np.ndarray | None) -> Committed:
+def committed(graph: Unrolled, n_cells: int, n_ways: int, number: np.ndarray | None) -> Committed:
     """Add the way out of each state to the states of a graph.
 
     Args:
         graph: Plain graph.
         n_cells: Number of cells of the grid.
-        number: Index of each bound and next way, shape (way, cell, next way), where the last next
-            way is the end of the path. It becomes `bound` of the edges. None to keep `bound`.
+        n_ways: Number of ways, which is the next way at the end of a path.
+        number: Index of each bound and next way, shape (way, cell, next way). It becomes `bound` of
+            the edges. None to keep `bound`.
     """
     way, entered = np.divmod(graph.bound, n_cells)
     move = way % END
@@ -86,11 +87,10 @@ def committed(graph: Unrolled, n_cells: int, number: np.ndarray | None) -> Commi
         is_kept = (after < 0) | (move[after] != END - 1 - move[edge])  # the reverse of m is 7 - m
         edge, after = edge[is_kept], after[is_kept]
 
-    is_last = after < 0
-    next_move = np.where(is_last, END, move[after])
+    next_way = np.where(after < 0, n_ways, way[after])
     bound = graph.bound[edge]
     if number is not None:
-        bound = number[way[edge], entered[edge], np.where(is_last, -1, way[after])]
+        bound = number[way[edge], entered[edge], next_way]
 
     tail = np.repeat(np.arange(len(graph.cell)), np.diff(graph.first))
     ends = [np.arange(*graph.first[s : s + 2]) + 1 for s in graph.starts]
@@ -104,8 +104,8 @@ def committed(graph: Unrolled, n_cells: int, number: np.ndarray | None) -> Commi
         starts=np.concatenate(ends).astype(graph.starts.dtype),
         turns=True,
     )
-    cell = (move[edge].astype(np.int64) * n_cells + entered[edge]) * (END + 1)
-    return Committed(whole, cell + next_move)
+    cell = (way[edge].astype(np.int64) * n_cells + entered[edge]) * (n_ways + 1)
+    return Committed(whole, cell + next_way)
 
 
 class ToGo(NamedTuple):

@@ -16,7 +16,7 @@ from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
 from trustbo.statespace import kalman
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES, along, bounds_along, bounds_and_next
+from trustbo.workspace.moves import along, bounds_along, next_names, pairs_along, way_names
 
 _STREAM = 0x6D697373  # makes the random numbers differ from others with the same seed
 
@@ -54,9 +54,8 @@ class ModelSimulator(DescribedSimulator):
                 measure along their paths; by default the workspace's awareness.
             n_ticks: Number of ticks of each bound; used only by the beta-binomial family, which
                 needs it.
-            p_fail: Probability that a bound fails. The shape is (move, row, col, next_move), as in
-                a draw of `hazard.BoundRisk`, or (move, row, col). Failed bounds are "stuck". By
-                default, no bound fails.
+            p_fail: Probability that a bound fails, as in `Planner.with_risk`, such as a draw of
+                `hazard.BoundRisk`. Failed bounds are "stuck". By default, no bound fails.
 
         Raises:
             TrustboError: The robots or features of the parameters or awareness do not match the
@@ -87,7 +86,7 @@ class ModelSimulator(DescribedSimulator):
                 f"family {self.model.likelihood.name!r} {needs} n_ticks; got {n_ticks}."
             )
 
-        self.p_fail = None if p_fail is None else _require_probabilities(p_fail, shape[1:4])
+        self.p_fail = None if p_fail is None else _require_probabilities(p_fail, workspace)
 
     def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
         """Run a path; the result depends on the seed, but not on the number of the mission."""
@@ -140,24 +139,27 @@ class ModelSimulator(DescribedSimulator):
         if self.p_fail is None:
             return n, "ok"
         rng = stream(seed, "failures")
-        p = self.p_fail[*bounds_and_next(cells).T]
+        p = self.p_fail[*pairs_along(cells, self.workspace.n_posts).T]
         failed = np.flatnonzero(rng.random(n) < p)
         return (int(failed[0]) + 1, "stuck") if len(failed) else (n, "ok")
 
 
 def _labels_of(workspace: Workspace) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
     """Return the dims of a workspace's awareness, and the names along them."""
-    names = {"robot": workspace.team.names, "move": MOVE_NAMES, "feature": workspace.features}
+    ways = tuple(way_names(workspace.n_posts))
+    names = {"robot": workspace.team.names, "move": ways, "feature": workspace.features}
     return tuple(str(dim) for dim in workspace.awareness.dims), names
 
 
-def _require_probabilities(p_fail: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Check failure probabilities, and return them as (move, row, col, next_move)."""
-    p = read_risk("p_fail", p_fail)
-    if p.shape[:3] != shape or p.shape[3:] != (len(NEXT_NAMES),):
+def _require_probabilities(p_fail: ArrayLike, workspace: Workspace) -> np.ndarray:
+    """Check failure probabilities, and return them as (way, row, col, next_way)."""
+    p = read_risk("p_fail", p_fail, (), workspace.n_posts)
+    shape = workspace.awareness.shape[1:4]
+    n_next = len(next_names(workspace.n_posts))
+    if p.shape != (*shape, n_next):
         raise TrustboError(
             f"p_fail must have the shape (move, row, col) = {shape}, or that with a last axis "
-            f"next_move of length {len(NEXT_NAMES)}; got {np.shape(p_fail)}."
+            f"next_move of length {n_next}; got {np.shape(p_fail)}."
         )
     bad = (p < 0.0) | (p > 1.0)
     if bad.any():

@@ -10,7 +10,7 @@ from trustbo.data import Cell
 from trustbo.parallel import in_order
 from trustbo.simulation.kinematic import KinematicSimulator, State
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import END, MOVE_NAMES, MOVES, NEXT_NAMES, possible_next
+from trustbo.workspace.moves import END, MOVES, next_names, possible_next, way_names
 
 _DIMS = ("move", "row", "col", "next_move")
 
@@ -36,7 +36,7 @@ The contact is NaN if it was not measured.
 
 def table_of(contact: np.ndarray, passed: np.ndarray) -> xr.Dataset:
     """Make a dataset like `Truth.bounds` from arrays (move, row, col, next_move)."""
-    names = {"move": list(MOVE_NAMES), "next_move": list(NEXT_NAMES)}
+    names = {"move": way_names(1), "next_move": next_names(1)}
     return xr.Dataset({"contact": (_DIMS, contact), "passed": (_DIMS, passed)}, names)
 
 

@@ -23,7 +23,7 @@ from trustbo.simulation.protocol import digest, require_path
 from trustbo.simulation.replicates import replicated
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
-from trustbo.workspace.moves import END, MOVES, bounds_and_next, by_cell_left, posts_along
+from trustbo.workspace.moves import END, MOVES, by_cell_left, pairs_along, posts_along
 
 
 class Truth(Summary):
@@ -195,7 +195,7 @@ class Truth(Summary):
                 "a truth knows the contact from the standard posts only, but the path has other "
                 "posts; measure the contact of missions instead."
             )
-        where = tuple(bounds_and_next(cells).T)
+        where = tuple(pairs_along(cells, 1).T)
         return self.bounds["contact"].values[where], self.bounds["passed"].values[where]
 
 

@@ -1,12 +1,13 @@
 """Difficulty of bounds, measured on the robots' routes relative to the robots' limits.
 
-Each measure is 0 on easy routes and about 1 at the robots' limit. T2 leaves the bound a -> c for
-the posts from which it watches the lead's next move, so its routes, and with them the difficulty,
-depend on the next move. The measure of a bound with its next move is the maximum over the routes of
-the lead and of T2.
+Each measure is 0 on easy routes and about 1 at the robots' limit. In the bound a -> c, T2 drives
+from its posts in a to the posts from which it watches the lead's next move. Its routes, and with
+them the difficulty, depend on the next move and on the sets of posts in both cells, which together
+are an option of the bound; see `moves`. The measure of a bound with an option is the maximum over
+the routes of the lead and of T2.
 
-In a bound, next moves with the same tilt share the steepest route, for example that of the lead.
-They pass or fail together, so they are one unit of the hazard model; see `Measured.unit`.
+In a bound, options with the same tilt share the steepest route, for example that of the lead. They
+pass or fail together, so they are one unit of the hazard model; see `Measured.unit`.
 
 Only plans that depend on failures need the difficulty of all bounds. Bounds are therefore measured
 when they are first asked for.
@@ -19,10 +20,12 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
+from trustbo.data import POST_SETS
 from trustbo.display import announced, slow_bar
 from trustbo.kernels import kernel, part
 from trustbo.parallel import in_order, plain
-from trustbo.workspace.moves import END, MOVES, possible_next
+from trustbo.team import Robot
+from trustbo.workspace.moves import MOVES, by_option, by_way, options_of, possible_next
 from trustbo.workspace.posts import Posts
 from trustbo.workspace.pursuit import Driving, tilt_along
 from trustbo.workspace.routes import SLACK, same_way, search
@@ -43,15 +46,15 @@ _part = part()
 
 
 class Measured(NamedTuple):
-    """Difficulty of bounds with each next move."""
+    """Difficulty of bounds, by option or, from `Difficulty.whole`, by way and next way."""
 
     values: np.ndarray
-    """Measures, shape (..., next_move, measure), NaN where there is no bound or no next bound.
-    Without a terrain, there are no measures."""
+    """Measures, shape (..., option, measure), NaN where there is no bound or no next bound. Without
+    a terrain, there are no measures."""
     unit: np.ndarray
-    """Index of the first next move of the same bound that has the same tilt, shape (...,
-    next_move); -1 where there is no bound or no next bound. Without a terrain, all next moves of a
-    bound are one unit."""
+    """Number of the first option of the same move and cell that has the same tilt, shape (...,
+    option); -1 where there is no bound or no next bound. Without a terrain, all options of a move
+    and a cell are one unit."""
 
 
 class Difficulty:
@@ -62,11 +65,11 @@ class Difficulty:
     (see `pursuit.tilt_along`), divided by the tangent of `max_slope`; it is at most 2. `narrowness`
     is 1 / (1 + w / 2 m), where w is the smallest distance to an impassable pixel. `tightness` is
     log(1 + l / 1 m) / 3, where l is the length of the route beside impassable pixels. All measures
-    are averaged over the next moves of a unit, which have the same tilt.
+    are averaged over the options of a unit, which have the same tilt.
 
     Attributes:
-        exists: Whether each bound exists and can be followed by the next move, shape (move, row,
-            col, next_move).
+        exists: Whether each bound exists and can be followed by the next way, shape (way, row, col,
+            next_way).
         measures: Names of the measures; none without a terrain.
     """
 
@@ -75,6 +78,7 @@ class Difficulty:
         bounds: np.ndarray,
         posts: Posts | None,
         traversability: np.ndarray | None = None,
+        n_posts: int = 1,
     ) -> None:
         """Prepare the difficulty of bounds.
 
@@ -82,39 +86,60 @@ class Difficulty:
             bounds: Whether each bound exists, shape (move, row, col).
             posts: The robots' posts and routes; None without a terrain.
             traversability: Traversability of each pixel, shape (row, col); None if unknown.
+            n_posts: Number of sets of posts.
         """
-        self.exists = possible_next(bounds)
+        self.exists = possible_next(bounds, n_posts)
         self.measures = () if posts is None else MEASURES
         self._posts = posts
         self._traversability = traversability
+        self._n_posts = n_posts
 
-        unit = np.where(self.exists, self.exists.argmax(-1)[..., None], _NONE)
+        self._options = by_option(self.exists)  # whether each option exists
+        unit = np.where(self._options, self._options.argmax(-1)[..., None], _NONE)
         self._maps = Measured(np.full((*unit.shape, len(self.measures)), np.nan), unit)
         self._is_measured = np.full(bounds.shape, posts is None)
 
     @property
     def is_whole(self) -> bool:
         """Whether all bounds are measured."""
-        return bool(self._is_measured[self.exists.any(-1)].all())
+        return bool(self._is_measured[self._options.any(-1)].all())
 
     def of(self, bounds: np.ndarray) -> Measured:
-        """Return the difficulty of bounds (bound, 3), given by move, row and column."""
+        """Return the difficulty of bounds (bound, 3), given by move, row and column, by option."""
         index = tuple(bounds.T)
-        missing = ~self._is_measured[index] & self.exists[index].any(-1)
+        missing = ~self._is_measured[index] & self._options[index].any(-1)
         if missing.any():
             self._measure(np.unique(bounds[missing], axis=0))
         return Measured(self._maps.values[index], self._maps.unit[index])
 
+    def units_of(self, pairs: np.ndarray) -> np.ndarray:
+        """Return the units of bounds with their next ways: move, row, column and first option.
+
+        Args:
+            pairs: Way, row, column and next way, shape (bound, 4); see `moves.pairs_along`.
+
+        Returns:
+            Units, shape (bound, 4). A bound that is not on the map is a unit of its own.
+        """
+        options = options_of(pairs, self._n_posts)
+        unit = self.of(options[:, :3]).unit[np.arange(len(options)), options[:, 3]]
+        options[:, 3] = np.where(unit >= 0, unit, options[:, 3])
+        return options
+
     def whole(self) -> Measured:
-        """Return the difficulty of all bounds, shape (move, row, col, next_move[, measure])."""
-        self.of(np.argwhere(self.exists.any(-1)))
-        return self._maps
+        """Return the difficulty of all bounds, shape (way, row, col, next_way[, measure])."""
+        self.of(np.argwhere(self._options.any(-1)))
+        values, unit = self._maps
+        by_measure = by_way(np.moveaxis(values, -1, 0), self._n_posts)
+        return Measured(np.moveaxis(by_measure, 0, -1), by_way(unit, self._n_posts))
 
     def restore(self, measured: Measured) -> None:
         """Use the result of `whole` for the same workspace, instead of measuring again."""
-        if measured.values.shape != self._maps.values.shape:
+        values, unit = measured
+        if values.shape != (*self.exists.shape, len(self.measures)):
             raise ValueError("the difficulty is that of another workspace")
-        self._maps = measured
+        by_measure = by_option(np.moveaxis(values, -1, 0))
+        self._maps = Measured(np.moveaxis(by_measure, 0, -1).copy(), by_option(unit))
         self._is_measured[:] = True
 
     def _measure(self, bounds: np.ndarray) -> None:
@@ -128,49 +153,68 @@ class Difficulty:
             measured = in_order(self._of_block, blocks)
             for block, values in zip(blocks, measured, strict=True):
                 index = tuple(block.T)
-                unit = _units_of(values[..., MEASURES.index(TILT)], self.exists[index])
+                unit = _units_of(values[..., MEASURES.index(TILT)], self._options[index])
                 self._maps.values[index] = _averaged(values, unit)
                 self._maps.unit[index] = unit
                 self._is_measured[index] = True  # last, for other threads
                 progress.update(len(block))
 
     def _of_block(self, bounds: np.ndarray) -> np.ndarray:
-        """Compute the measures of bounds (bound, 3) before averaging, (bound, next_move, measure).
+        """Compute the measures of bounds (bound, 3) before averaging, (bound, option, measure).
 
-        The route of a robot leads from one position to up to nine others.
+        The lead has one route. Each robot of T2 has routes from its post of each set to those of
+        all next ways.
         """
         posts = cast("Posts", self._posts)
-        surface = posts.surface
-        exists = self.exists[*bounds.T]
-        n_robots = len(posts.team.robots)
+        team = posts.team
+        sets = POST_SETS[: self._n_posts]
+        follows = self.exists[*bounds.T]  # with the standard set, as with any other
 
-        windows = np.empty((len(bounds), 4), int)
-        starts = np.empty((1 + n_robots, len(bounds), 2))
-        goals = np.full((1 + n_robots, *exists.shape, 2), np.nan)
+        n_bounds, n_next = follows.shape
+        windows = np.empty((n_bounds, 4), int)
+        stops = np.empty((2, n_bounds, 1, 2))
+        starts = np.empty((len(team.robots), n_bounds, len(sets), 2))
+        goals = np.full((len(team.robots), n_bounds, n_next, 2), np.nan)
         for k, (move, row, col) in enumerate(bounds.tolist()):
             a = row - MOVES[move][0], col - MOVES[move][1]
             c = row, col
             windows[k] = posts.window(a, c)
-            starts[0, k] = posts.stop(a)
-            goals[0, k] = posts.stop(c)
-            starts[1:, k] = posts.watching(a, c)
-            for n in np.flatnonzero(exists[k]).tolist():
-                onward = None if n == END else (c[0] + MOVES[n][0], c[1] + MOVES[n][1])
-                goals[1:, k, n] = posts.watching(c, onward)
+            stops[:, k, 0] = posts.stop(a), posts.stop(c)
+            for number, name in enumerate(sets):
+                starts[:, k, number] = posts.watching((*a, name), c)
+            for n in np.flatnonzero(follows[k, :-1]).tolist():
+                number, onward = divmod(n, len(MOVES))
+                b = row + MOVES[onward][0], col + MOVES[onward][1]
+                goals[:, k, n] = posts.watching((*c, sets[number]), b)
+            goals[:, k, -1] = posts.watching(c, None)
 
+        one = np.ones((n_bounds, 1), bool)
+        worst = np.fmax(0.0, self._of_robot(team.lead, windows, *stops, one))  # NaN without a route
+        for robot, start, goal in zip(team.robots, starts, goals, strict=True):
+            worst = np.fmax(worst, self._of_robot(robot, windows, start, goal, follows))
+        worst = worst.reshape(n_bounds, -1, len(MEASURES))
+        worst[~self._options[*bounds.T]] = np.nan
+        return worst
+
+    def _of_robot(
+        self,
+        robot: Robot,
+        windows: np.ndarray,
+        starts: np.ndarray,
+        goals: np.ndarray,
+        exists: np.ndarray,
+    ) -> np.ndarray:
+        """Compute the measures of a robot's routes; see `_of_routes`."""
+        posts = cast("Posts", self._posts)
+        surface = posts.surface
         rasters = self._easy, posts.routes.room, surface.gradient
         place = surface.pixel, surface.origin
-        robots = posts.team.lead, *posts.team.robots
-        worst = np.zeros((*exists.shape, len(MEASURES)))
-        for robot, start, goal in zip(robots, starts, goals, strict=True):
-            from_pixel = np.stack(surface.nearest(*start.T), axis=-1)
-            to_pixel = np.stack(surface.nearest(*np.moveaxis(goal, -1, 0)), axis=-1)
-            ways = (start, from_pixel), (goal, to_pixel)
-            pace = posts.routes.pace(robot.max_slope)
-            of_robot = _of_robot(pace, rasters, place, Driving.of(robot), windows, *ways, exists)
-            worst = np.fmax(worst, of_robot)  # NaN where the robot has no route
-        worst[~exists] = np.nan
-        return worst
+        ends = [
+            (at, np.stack(surface.nearest(*np.moveaxis(at, -1, 0)), axis=-1))
+            for at in (starts, goals)
+        ]
+        pace = posts.routes.pace(robot.max_slope)
+        return _of_routes(pace, rasters, place, Driving.of(robot), windows, *ends, exists)
 
     @cached_property
     def _easy(self) -> np.ndarray:
@@ -181,8 +225,8 @@ class Difficulty:
 
 
 @_compiled
-def _of_robot(pace, rasters, place, driving, windows, starts, goals, exists):
-    """Compute the measures of a robot's routes in bounds, shape (bound, next_move, measure).
+def _of_routes(pace, rasters, place, driving, windows, starts, goals, exists):
+    """Compute the measures of a robot's routes in bounds, shape (bound, start, goal, measure).
 
     Args:
         pace: Inverse of the robot's speed on each pixel; see `Routes.pace`.
@@ -190,17 +234,17 @@ def _of_robot(pace, rasters, place, driving, windows, starts, goals, exists):
         place: Size of a pixel, and position of the centre of pixel (0, 0).
         driving: Parameters of the robot.
         windows: Pixel window of each bound, shape (bound, 4).
-        starts: Positions from which the routes lead, shape (bound, 2), and their pixels.
-        goals: Positions to which the routes lead, shape (bound, next_move, 2), and their pixels.
-        exists: Whether a bound can be followed by each next move, shape (bound, next_move).
+        starts: Positions from which the routes lead, shape (bound, start, 2), and their pixels.
+        goals: Positions to which the routes lead, shape (bound, goal, 2), and their pixels.
+        exists: Whether a bound has each goal, shape (bound, goal).
 
     Returns:
-        The measures; NaN where there is no next move or no route.
+        The measures; NaN where there is no goal or no route.
     """
     start, from_pixel = starts
     goal, to_pixel = goals
     pixel, _ = place
-    measured = np.full((*exists.shape, 4), np.nan)
+    measured = np.full((*start.shape[:2], exists.shape[1], 4), np.nan)
 
     for b in range(len(exists)):
         top, bottom, left, right = windows[b]
@@ -211,24 +255,35 @@ def _of_robot(pace, rasters, place, driving, windows, starts, goals, exists):
             ends[k, 0] = to_pixel[b, nexts[k], 0] - top
             ends[k, 1] = to_pixel[b, nexts[k], 1] - left
 
-        begin = from_pixel[b, 0] - top, from_pixel[b, 1] - left
-        best, came = search(within, pixel, begin, ends, SLACK)
-        for k in range(len(nexts)):
-            n = nexts[k]
-            same = -1
-            for other in nexts[:k]:  # next moves share many routes
-                if goal[b, n, 0] == goal[b, other, 0] and goal[b, n, 1] == goal[b, other, 1]:
-                    same = other
-            if same >= 0:
-                for m in range(measured.shape[2]):
-                    measured[b, n, m] = measured[b, same, m]
+        for s in range(start.shape[1]):
+            same = _first(start[b], s)  # sets of posts and next ways share many routes
+            if same < s:
+                measured[b, s] = measured[b, same]
                 continue
 
-            way = same_way(within, pixel, best, came, begin, (ends[k, 0], ends[k, 1]))
-            if len(way) > 0:
-                across = start[b], goal[b, n]
-                _of_way(way, (top, left), across, rasters, place, driving, measured[b, n])
+            begin = from_pixel[b, s, 0] - top, from_pixel[b, s, 1] - left
+            best, came = search(within, pixel, begin, ends, SLACK)
+            for k in range(len(nexts)):
+                n = nexts[k]
+                same = _first(goal[b], n)
+                if same < n:
+                    measured[b, s, n] = measured[b, s, same]
+                    continue
+
+                way = same_way(within, pixel, best, came, begin, (ends[k, 0], ends[k, 1]))
+                if len(way) > 0:
+                    across = start[b, s], goal[b, n]
+                    _of_way(way, (top, left), across, rasters, place, driving, measured[b, s, n])
     return measured
+
+
+@_part
+def _first(positions, k):
+    """Return the index of the first position (position, 2) that equals position `k`."""
+    for i in range(k):
+        if positions[i, 0] == positions[k, 0] and positions[i, 1] == positions[k, 1]:
+            return i
+    return k
 
 
 @_part
@@ -277,13 +332,13 @@ def _of_way(way, corner, across, rasters, place, driving, out):
 
 
 def _units_of(tilt: np.ndarray, exists: np.ndarray) -> np.ndarray:
-    """Return the first next move with the same tilt, (bound, next_move); -1 if none."""
+    """Return the first option with the same tilt, (bound, option); -1 if none."""
     same = tilt[..., None, :] == tilt[..., None]  # NaN equals nothing
     return np.where(exists, same.argmax(-1), _NONE)
 
 
 def _averaged(values: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return the measures (bound, next_move, measure) as means over each unit."""
+    """Return the measures (bound, option, measure) as means over each unit."""
     means = values.copy()
     for n in range(unit.shape[-1]):
         member = unit == n

@@ -90,7 +90,7 @@ def onward_maps(posts: Posts, passable: np.ndarray, n_posts: int) -> np.ndarray:
     """
     exists = existing_bounds(passable)
     watching = _posts_of_ways(posts, exists, n_posts)
-    pairs = np.argwhere(np.tile(possible_next(exists)[..., :-1], (n_posts, 1, 1, n_posts)))
+    pairs = np.argwhere(possible_next(exists, n_posts)[..., :-1])
     n_ways = len(MOVES) * n_posts
     robots = posts.team.robots
     maps = np.full((len(robots), n_ways, *passable.shape, n_ways), np.nan, np.float32)

@@ -2,6 +2,10 @@
 
 A way is a move together with the set of posts from which T2 watches the lead: the number of a way
 is move + 8 set, where set 0 is the standard one. With a single set, ways are moves.
+
+An option of a move into a cell is the set of posts together with the next way: the number of an
+option is next way + (number of ways + 1) set. With a single set, options are next moves. Maps by
+way, (way, row, col, next_way), have the same values as maps by option, (move, row, col, option).
 """
 
 from collections.abc import Sequence
@@ -16,9 +20,8 @@ MOVES = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 MOVE_NAMES = ("nw", "n", "ne", "w", "e", "sw", "s", "se")
 """Compass directions of `MOVES`, with row 0 in the north."""
 END = len(MOVES)
-"""Index used instead of the next move for a bound that ends the path."""
-NEXT_NAMES = (*MOVE_NAMES, "end")
-"""Names of the moves that can follow a bound, and `"end"`."""
+"""Index used instead of the next move for a bound that ends the path, with a single set of posts;
+in general, this index is the number of ways."""
 
 
 def require_on_grid(
@@ -44,6 +47,11 @@ def way_names(n_posts: int) -> list[str]:
     """Return the names of the ways with the first `n_posts` sets of posts: "ne", ..., "ne far"."""
     others = [f"{move} {name}" for name in POST_SETS[1:n_posts] for move in MOVE_NAMES]
     return [*MOVE_NAMES, *others]
+
+
+def next_names(n_posts: int) -> list[str]:
+    """Return the names of the ways that can follow a bound, and `"end"`."""
+    return [*way_names(n_posts), "end"]
 
 
 def cells_along(path: Sequence[Station] | np.ndarray) -> np.ndarray:
@@ -80,15 +88,6 @@ def bounds_along(path: Sequence[Station] | np.ndarray) -> np.ndarray:
     return np.column_stack([ways, cells_along(path)[1:]])
 
 
-def bounds_and_next(path: Sequence[Station] | np.ndarray) -> np.ndarray:
-    """Return the move, row, column and next move of each bound of a path, shape (bound, 4).
-
-    The next move of the last bound is `END`. Raises TrustboError as `moves_along` does.
-    """
-    bounds = np.column_stack([moves_along(path), cells_along(path)[1:]])
-    return np.column_stack([bounds, np.append(bounds[1:, 0], END)])
-
-
 def pairs_along(path: Sequence[Station] | np.ndarray, n_posts: int) -> np.ndarray:
     """Return the way, row, column and next way of each bound of a path, shape (bound, 4).
 
@@ -99,15 +98,40 @@ def pairs_along(path: Sequence[Station] | np.ndarray, n_posts: int) -> np.ndarra
     return np.column_stack([bounds, after])
 
 
-def possible_next(bounds: np.ndarray) -> np.ndarray:
-    """Return whether each bound can be followed by each next move, (move, row, col, next_move).
+def possible_next(bounds: np.ndarray, n_posts: int = 1) -> np.ndarray:
+    """Return whether each bound can be followed by each next way, (way, row, col, next_way).
 
     Args:
         bounds: Whether each bound exists, shape (move, row, col).
+        n_posts: Number of sets of posts, from each of which each bound can be watched.
     """
-    onward = by_cell_left(bounds, False)
+    onward = np.tile(by_cell_left(bounds, False), (n_posts, 1, 1))
     anything = np.ones(bounds.shape[1:], bool)  # a path can end in any cell
-    return bounds[..., None] & np.stack([*onward, anything], axis=-1)
+    follows = bounds[..., None] & np.stack([*onward, anything], axis=-1)
+    return np.tile(follows, (n_posts, 1, 1, 1))
+
+
+def by_option(maps: np.ndarray) -> np.ndarray:
+    """Convert maps by way, (..., way, row, col, next_way), to (..., move, row, col, option)."""
+    *leading, n_ways, rows, cols, n_next = maps.shape
+    n_posts = n_ways // len(MOVES)
+    of_sets = maps.reshape(*leading, n_posts, len(MOVES), rows, cols, n_next)
+    return np.moveaxis(of_sets, -5, -2).reshape(*leading, len(MOVES), rows, cols, n_posts * n_next)
+
+
+def by_way(maps: np.ndarray, n_posts: int) -> np.ndarray:
+    """Convert maps by option, (..., move, row, col, option), to (..., way, row, col, next_way)."""
+    *leading, n_moves, rows, cols, n_options = maps.shape
+    n_next = n_options // n_posts
+    of_sets = maps.reshape(*leading, n_moves, rows, cols, n_posts, n_next)
+    return np.moveaxis(of_sets, -2, -5).reshape(*leading, n_posts * n_moves, rows, cols, n_next)
+
+
+def options_of(pairs: np.ndarray, n_posts: int) -> np.ndarray:
+    """Convert ways and next ways, (bound, 4) as in `pairs_along`, to move, row, col and option."""
+    way, row, col, after = pairs.T
+    number, move = np.divmod(way, len(MOVES))
+    return np.column_stack([move, row, col, number * (len(MOVES) * n_posts + 1) + after])
 
 
 def by_cell_left(values: np.ndarray, nowhere: float) -> np.ndarray:

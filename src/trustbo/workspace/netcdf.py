@@ -11,7 +11,7 @@ from trustbo.team import Robot, Team
 from trustbo.terrain import CompositeIndex
 from trustbo.workspace.difficulty import Difficulty, Measured
 from trustbo.workspace.grid import Grid
-from trustbo.workspace.moves import MOVE_NAMES, NEXT_NAMES
+from trustbo.workspace.moves import MOVES, next_names, way_names
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import surface_of
@@ -89,7 +89,8 @@ def difficulty_to_tree(difficulty: Difficulty) -> xr.DataTree:
     """Convert the difficulty of all bounds to a data tree."""
     values, unit = difficulty.whole()
     bounds = "move", "row", "col", "next_move"
-    names = {"move": list(MOVE_NAMES), "next_move": list(NEXT_NAMES)}
+    n_posts = len(unit) // len(MOVES)
+    names = {"move": way_names(n_posts), "next_move": next_names(n_posts)}
     maps = {"difficulty": ((*bounds, "measure"), values), "unit": (bounds, unit.astype(np.int8))}
     return xr.DataTree(xr.Dataset(maps, names | {"measure": list(difficulty.measures)}))
 

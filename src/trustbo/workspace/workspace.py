@@ -136,8 +136,7 @@ class Workspace(Summary):
                 bound. With more than one, planners choose a set in each cell of a path together
                 with the cells. The sets are, in this order: "standard"; "far", up to 60 m from the
                 lead's stop and 20 m apart; and "route", mostly for the sight of the lead's route.
-                Line of sight and traversability differ between sets; the difficulty of driving is
-                that of the standard one.
+                Line of sight, traversability and the difficulty of driving differ between sets.
 
         Raises:
             TrustboError: The dataset is not a terrain, the grid is too fine for the raster, all
@@ -314,7 +313,8 @@ class Workspace(Summary):
         traversability = None
         if self.pixels is not None and TRAVERSABLE in self.pixels:
             traversability = self.pixels[TRAVERSABLE].values
-        return Difficulty(self.passable_bounds.values, self.posts, traversability)
+        bounds = self.passable_bounds.values
+        return Difficulty(bounds, self.posts, traversability, self.n_posts)
 
     def along(self, path: Sequence[Station], *, anywhere: bool = False) -> np.ndarray:
         """Return the awareness of a path's bounds, shape (bound, robot, feature), in [0, 1].
