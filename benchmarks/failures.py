@@ -37,7 +37,7 @@ from trustbo.hazard.given import GivenRisk
 from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.replicates import replicated
 from trustbo.workspace.difficulty import MEASURES
-from trustbo.workspace.moves import END, MOVES, bounds_and_next
+from trustbo.workspace.moves import END, MOVES, pairs_along
 
 GROUNDS = (("topography", 18), ("tahoe", 18), ("synthetic-0", 14), ("wellington", 38))
 WORLDS = [f"{ground}:{limit}:{excess}" for ground, limit in GROUNDS for excess in (0, 2, 4)]
@@ -170,7 +170,7 @@ def chances(risk, path):
     """Compute the failure probability of a path from means, components, and 20 000 draws."""
     risks = GivenRisk(risk.mean), GivenRisk(risk.mean, components=risk.components())
     joint = [one.failure(path) for one in risks]
-    drawn = risk.draw(20_000, seed=1)[:, *bounds_and_next(path).T]
+    drawn = risk.draw(20_000, seed=1)[:, *pairs_along(path, 1).T]
     return [f"{p:.3f}" for p in (*joint, 1.0 - np.prod(1.0 - drawn, axis=1).mean())]
 
 

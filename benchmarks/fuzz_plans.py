@@ -110,14 +110,19 @@ def draw_model(rng, z, kind):
     return params, u, np.full((1, 1), beta0), np.full(1, x0), sd, np.full((1, n), beta[1] / n)
 
 
-def draw_risk(rng, shape, of_contact):
+def draw_risk(rng, of_posts, shape, n_posts, of_contact):
     """Draw failure probabilities, components or None, and planner options.
 
     The probabilities have shape (move, row, col), or (move, row, col, next_move) in half of the
-    problems, which then depend on the next move.
+    problems, which then depend on the next move. In three quarters of the problems with several
+    sets of posts, they also depend on the sets: moves, next moves, or both are ways.
     """
-    if rng.random() < 0.5:
-        shape = (*shape, 9)
+    by_next = rng.random() < 0.5
+    if n_posts > 1 and of_posts.random() < 0.75:
+        shape = (8 * n_posts, *shape[1:])
+        by_next = pick(of_posts, by_next, True)
+    if by_next:
+        shape = (*shape, 8 * n_posts + 1 if shape[0] > 8 and of_posts.random() < 0.8 else 9)
     p = np.where(rng.random(shape) < 0.4, rng.uniform(0.0, 0.5, shape), 0.02)
     p = np.where(rng.random(shape) < 0.1, rng.choice([0.0, 1.0, 0.1], shape), p)
     components, options = None, {}
@@ -137,14 +142,18 @@ def draw_risk(rng, shape, of_contact):
     return p, components, options
 
 
-def risks_of(p, components):
-    """Return risks (sum, move, cell, next move) of each component, or of the mean, and shares."""
+def risks_of(p, components, n_posts):
+    """Return risks (sum, way, cell, next way) of each component, or of the mean, and shares."""
     some, share = (p[None], np.ones(1)) if components is None else components
     with np.errstate(divide="ignore"):
         risk = np.minimum(-np.log1p(-some), 700.0)
     if p.ndim == 3:
         risk = np.repeat(risk[..., None], 9, axis=-1)
-    return risk.reshape(len(some), 8, -1, 9), share
+    if risk.shape[1] == 8:
+        risk = np.concatenate([risk] * n_posts, axis=1)
+    if risk.shape[-1] == 9:
+        risk = np.concatenate([risk[..., :-1]] * n_posts + [risk[..., -1:]], axis=-1)
+    return risk.reshape(len(some), 8 * n_posts, -1, 8 * n_posts + 1), share
 
 
 def draw_problem(rng):
@@ -182,7 +191,7 @@ def draw_problem(rng):
     p, components, options = (
         (None, None, {})
         if rng.random() < 0.4
-        else draw_risk(rng, (8, *shape), objective == "lost_contact")
+        else draw_risk(rng, of_posts, (8, *shape), n_posts, objective == "lost_contact")
     )
     planner = Planner(
         workspace, start, goal, objective, family=family,
@@ -191,11 +200,12 @@ def draw_problem(rng):
     )  # fmt: skip
     if closed.any():
         planner = planner.avoiding(closed, np.zeros(closed.shape))
-    risk, share, failure = np.zeros((1, 8, passable.size, 9)), np.ones(1), np.zeros(1)
+    n_ways = 8 * n_posts
+    risk, share, failure = np.zeros((1, n_ways, passable.size, n_ways + 1)), np.ones(1), np.zeros(1)
     if p is not None:
         planner = planner.with_risk(p, None, components)
         cost = options.get("failure_cost", float(shortest)) if objective == "lost_contact" else 0.0
-        risk, share = risks_of(p, components)
+        risk, share = risks_of(p, components, n_posts)
         failure = cost * share
     limit = options.get("max_failure", np.inf)
     return planner, params, World(

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.special import expit, ndtr
 
 STEPS = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
-NONE = 8  # instead of a move: the walk begins here, or ends here
 
 
 class World(NamedTuple):
@@ -30,7 +29,7 @@ class World(NamedTuple):
     sd: float
     longest: int
     turns: bool
-    risk: np.ndarray  # (sum, move, cell entered, next move or NONE), -log(1 - p)
+    risk: np.ndarray  # (sum, way, cell entered, next way or the number of ways), -log(1 - p)
     failure: np.ndarray  # (sum,), cost of failing by each sum
     share: np.ndarray  # (sum,), probability of each sum
     limit: float  # on the probability to fail
@@ -93,11 +92,11 @@ def best_walk(world, most):
         if k > 1:  # what happens in a bound depends on the next way, which is known only now
             x = world.B0 @ x + world.u[:, came[walk], cell[walk], way]
             cost = cost + world.loss(x.mean(0))
-            risk = risk + world.risk[:, came[walk] % 8, cell[walk], m]
+            risk = risk + world.risk[:, came[walk], cell[walk], way]
         bound_cost = bound_cost[walk] + world.bound_cost[m, other]
         cell, came, there = other, way, other == world.goal
         last = world.loss((world.B0 @ x + world.u[:, way, other, -1]).mean(0))
-        ended = risk + world.risk[:, m, other, NONE]
+        ended = risk + world.risk[:, way, other, -1]
         scores.append(world.score(cost + last, last, bound_cost, ended, k)[there])
         sums.append(-np.tensordot(world.share, np.expm1(-ended[:, there]), 1))
         on = ~there
@@ -124,7 +123,7 @@ def score_along(world, path):
     for way, c, after in zip(ways, cells[1:], [*ways[1:], -1], strict=True):
         x = world.B0 @ x + world.u[:, way, c, after]
         costs.append(world.loss(x.mean()))
-        risk = risk + world.risk[:, way % 8, c, NONE if after < 0 else after % 8]
+        risk = risk + world.risk[:, way, c, after]
     if len(costs) > world.longest or -world.share @ np.expm1(-risk) > world.limit:
         return -np.inf
     return world.score(sum(costs), costs[-1], bound_cost, risk, len(costs))

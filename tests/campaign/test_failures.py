@@ -12,7 +12,7 @@ from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import LostMission
-from trustbo.workspace.moves import END, bounds_along, bounds_and_next, moves_along
+from trustbo.workspace.moves import END, bounds_along, moves_along, pairs_along
 
 ENDS = ((3, 0), (0, 3))
 DOUBTFUL = Hazard(margin=(1.0, 1.0))  # the limit is probably too high
@@ -149,7 +149,7 @@ def test_a_plan_lists_the_failures_on_the_way_into_its_cells(workspace):
     in_plan = {(f.bound, f.way) for f in campaign.plan.past_failures}
     assert in_plan == {(k, path[1:4]) for k, cell in enumerate(planned) if cell == path[2]}
 
-    p_fail = campaign.risk.mean[*bounds_and_next(path[1:4])[0]]
+    p_fail = campaign.risk.mean[*pairs_along(path[1:4], 1)[0]]
     other_side = ((3, 0), (2, 1), (1, 1), (1, 2), (0, 3))
     other_move = ((3, 0), (2, 0), (1, 1), (1, 2), (0, 3))
     for suggested in (other_side, other_move, path):
@@ -277,7 +277,7 @@ def test_price_after_a_failure_is_joint_over_strata(steep):
     problem = campaign.planner.problem
     path = campaign.planner.plan(campaign.belief.mean()).path
     p, weights = campaign.risk.components()
-    joint = 8.0 * weights @ (1.0 - np.prod(1.0 - p[:, *bounds_and_next(path).T], axis=1))
+    joint = 8.0 * weights @ (1.0 - np.prod(1.0 - p[:, *pairs_along(path, 1).T], axis=1))
     assert problem.failure_along(path) == pytest.approx(joint, rel=1e-12)
     assert joint < 8.0 * (1.0 - np.prod(1.0 - problem.risk.along(path).p_fail)) - 1e-3
 

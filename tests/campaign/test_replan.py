@@ -14,7 +14,7 @@ from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.models import PooledTrust
 from trustbo.planning import NoPathError, Planner
-from trustbo.workspace.moves import END, bounds_along, bounds_and_next
+from trustbo.workspace.moves import END, bounds_along, pairs_along
 
 ENDS = ((3, 0), (0, 3))
 PATH = ((3, 0), (2, 1), (1, 2), (0, 3))
@@ -116,7 +116,7 @@ def test_the_rest_is_the_best_of_all_rests(objective, family):
         seed = campaign.state.seed_of("hazard")
         p_fail, weights = BoundRisk(fit_hazard(tried, workspace, seed=seed), workspace).components()
         for k, rest in enumerate(rests):
-            passes = np.prod(1.0 - p_fail[:, *bounds_and_next(rest).T], axis=1)
+            passes = np.prod(1.0 - p_fail[:, *pairs_along(rest, 1).T], axis=1)
             values[k] -= fewest * weights @ (1.0 - passes)
 
     found = values[rests.index(plan.path[3:])]
@@ -325,7 +325,7 @@ def test_a_bound_that_stopped_robots_is_not_planned_again_with_its_next_move(log
     campaign = tb.Campaign(hilly, *ENDS)
     path = campaign.ask().path
     k = 3
-    planned = tuple(bounds_and_next(path)[k])
+    planned = tuple(pairs_along(path, 1)[k])
     before = campaign.risk.mean[planned]
     of_units = hilly.difficulty.whole().unit[planned[:3]]
     assert of_units[planned[3]] not in (of_units[END], of_units[6])  # south is the way back
@@ -346,4 +346,4 @@ def test_a_bound_that_stopped_robots_is_not_planned_again_with_its_next_move(log
         campaign.tell(told(new, stuck + ["ok"] * (len(new) - k - 2)))
 
     assert campaign.risk.mean[planned] > max(0.1, 2.0 * before)
-    assert planned not in [tuple(bound) for bound in bounds_and_next(campaign.ask().path)]
+    assert planned not in [tuple(bound) for bound in pairs_along(campaign.ask().path, 1)]

@@ -11,7 +11,7 @@ from trustbo.hazard.given import GivenRisk
 from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import LostMission
-from trustbo.workspace.moves import bounds_and_next
+from trustbo.workspace.moves import pairs_along
 
 
 def squares(values, ends):
@@ -69,7 +69,7 @@ def test_few_strata_have_the_chance_to_fail_that_all_draws_have(risk):
     risk, path = risk
     planner_risks = [GivenRisk(risk.mean, components=risk.components(n)) for n in (1, 5)]
     product, five = (of_path.failure(path) for of_path in planner_risks)
-    index = bounds_and_next(path).T
+    index = pairs_along(path, 1).T
     drawn = 1.0 - np.prod(1.0 - risk.draw(10_000, seed=1)[:, *index], axis=1)
     assert abs(five - drawn.mean()) < 0.02
     assert product > drawn.mean() + 0.04
@@ -82,7 +82,7 @@ def test_the_arrival_probability_is_that_of_many_draws(risk):
     risk, path = risk
     for driven in (path, [*path[:3], *path[1:3], *path[3:]]):
         along = risk.along(driven)
-        index = bounds_and_next(driven).T
+        index = pairs_along(driven, 1).T
         drawn = np.prod(1.0 - risk.draw(10_000, seed=1)[:, *index], axis=1)
         # 5 standard errors; there are 1000 distinct hyperparameters.
         assert abs(along.p_arrive - drawn.mean()) < 5.0 * drawn.std() / np.sqrt(1000)

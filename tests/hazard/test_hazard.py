@@ -338,21 +338,22 @@ def test_a_failure_whose_next_move_is_unknown_is_shared_by_all_next_moves():
     assert counted.bounds.tolist() == [[east, *b, east], [east, *c, UNKNOWN], [east, *c, END]]
 
     # c has three next moves: south, the end of the path, and back, of which two are one unit.
-    unit = np.full((8, 2, 3, 9), -1)
-    unit[east, 0, 1, [east, END]] = east
-    unit[east, 0, 2, [south, END]] = south
-    unit[east, 0, 2, 3] = 3
-    shared = counted.with_known_next(unit)
+    exists = np.zeros((8, 2, 3, 9), bool)
+    exists[east, 0, 1, [east, END]] = True
+    exists[east, 0, 2, [3, south, END]] = True
+    shared = counted.with_known_next(exists)
     assert shared.bounds[1:].tolist() == [[east, *c, 3], [east, *c, south], [east, *c, END]]
     np.testing.assert_allclose(shared.failed, [0.0, 1 / 3, 1 / 3, 1 / 3])
     np.testing.assert_allclose(shared.n, [1.0, 1 / 3, 1 / 3, 1 / 3])
-    np.testing.assert_allclose(shared.of_units(unit).failed, [0.0, 1 / 3, 2 / 3])
+    units = shared.bounds.copy()
+    units[-1, 3] = south
+    np.testing.assert_allclose(shared.of_units(units).failed, [0.0, 1 / 3, 2 / 3])
     assert [shared.bounds[i].tolist() for i in shared.lost[0]] == [
         [east, *b, east],
         [east, *c, END],
     ]
 
-    nowhere = counted.with_known_next(np.full(unit.shape, -1))
+    nowhere = counted.with_known_next(np.zeros(exists.shape, bool))
     assert nowhere.bounds.tolist() == [[east, *b, east], [east, *c, END]]
 
 

@@ -1,5 +1,6 @@
 """Difficulty of bounds, from the ways that robots drive."""
 
+import dataclasses
 import math
 
 import networkx as nx
@@ -9,9 +10,11 @@ from scipy import ndimage
 from worlds import random_cells, terrain_of
 
 import trustbo as tb
+from trustbo.data import POST_SETS
 from trustbo.simulation.replicates import replicated
 from trustbo.workspace.difficulty import MEASURES
-from trustbo.workspace.moves import END, MOVES
+from trustbo.workspace.moves import END, MOVES, by_option, by_way, options_of
+from trustbo.workspace.netcdf import difficulty_to_tree, restore_difficulty
 
 EAST = 4
 TILT = MEASURES.index("tilt")
@@ -249,3 +252,81 @@ def test_only_bounds_that_are_asked_for_are_measured():
     np.testing.assert_array_equal(some.unit, whole.unit[*bounds.T])
     assert not again.is_whole
     np.testing.assert_array_equal(again.whole().values, whole.values)
+
+
+@pytest.fixture(scope="module")
+def with_sets():
+    """Hilly ground with three sets of posts."""
+    terrain = tb.terrain.synthetic_terrain((150.0, 150.0), resolution=2.0, seed=3, relief=8.0)
+    return tb.Workspace.from_terrain(terrain, (4, 4), team_of(11.0), n_posts=3)
+
+
+def test_difficulty_with_sets_is_that_of_the_routes_from_set_to_set(with_sets):
+    """By `bound_routes`, which the simulator drives; averaged over routes of the same tilt."""
+    posts = with_sets.posts
+    robots = posts.team.lead, *posts.team.robots
+    difficulty = with_sets.difficulty
+    exists = difficulty.exists
+    measured = difficulty.whole()
+
+    for move, row, col in np.argwhere(exists[:8].any(-1))[::17].tolist():
+        left = row - MOVES[move][0], col - MOVES[move][1]
+        pairs = [
+            (way, n)
+            for way in range(move, 24, 8)
+            for n in np.flatnonzero(exists[way, row, col]).tolist()
+        ]
+        worst = []
+        for way, n in pairs:
+            ahead, after = None, 0
+            if n < 24:
+                after, onward = divmod(n, 8)
+                ahead = row + MOVES[onward][0], col + MOVES[onward][1]
+            a, c = (*left, POST_SETS[way // 8]), (row, col, POST_SETS[after])
+            routes = zip(robots, posts.bound_routes(a, c, ahead), strict=True)
+            worst.append(np.max([measures_of(with_sets, *one) for one in routes], axis=0))
+
+        tilt = np.round(np.array(worst)[:, TILT], 9)
+        where = tuple(np.array([(way, row, col, n) for way, n in pairs]).T)
+        expected = averaged(np.array(worst), tilt)
+        np.testing.assert_allclose(measured.values[where], expected, atol=1e-6)
+        options = [way // 8 * 25 + n for way, n in pairs]
+        first = [options[tilt.tolist().index(t)] for t in tilt]
+        np.testing.assert_array_equal(measured.unit[where], first)
+
+
+def test_sets_share_units_and_differ_in_others(with_sets):
+    measured = with_sets.difficulty.whole()
+    unit = by_option(measured.unit)
+    of_standard = unit[..., :25].max(-1)
+    far = unit[..., 25:50]
+    assert (far >= 25).any()  # steeper than all routes of the standard set
+    assert ((far >= 0) & (far < 25)).any()
+    assert of_standard.max() < 25
+    tilt = measured.values[..., TILT]
+    assert np.nanmean(tilt[8:16]) > np.nanmean(tilt[:8])
+
+
+def test_difficulty_with_sets_is_stored(with_sets):
+    tree = difficulty_to_tree(with_sets.difficulty)
+    dims = "move", "row", "col", "next_move"
+    assert tree["unit"].dims == dims
+    assert tree["difficulty"].dims == (*dims, "measure")
+    assert tree["next_move"].values.tolist() == [*with_sets.awareness["move"].values, "end"]
+
+    again = dataclasses.replace(with_sets)
+    assert not again.difficulty.is_whole
+    restore_difficulty(again, tree)
+    assert again.difficulty.is_whole
+    bounds = np.argwhere(with_sets.passable_bounds.values)
+    for a, b in zip(again.difficulty.of(bounds), with_sets.difficulty.of(bounds), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_maps_by_way_and_by_option_have_the_same_values():
+    maps = RNG.random((2, 24, 3, 4, 25))
+    by_bound = by_option(maps)
+    np.testing.assert_array_equal(by_way(by_bound, 3), maps)
+    pairs = np.column_stack([RNG.integers(n, size=50) for n in maps.shape[1:]])
+    np.testing.assert_array_equal(by_bound[:, *options_of(pairs, 3).T], maps[:, *pairs.T])
+    np.testing.assert_array_equal(by_option(maps[:, :8, ..., :9]), maps[:, :8, ..., :9])

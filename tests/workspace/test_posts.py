@@ -11,7 +11,7 @@ from trustbo.data import POST_SETS
 from trustbo.simulation import KinematicSimulator, Truth
 from trustbo.workspace import MOVES
 from trustbo.workspace.line_of_sight import N_SAMPLES, Geometry, bound_features
-from trustbo.workspace.moves import bounds_along, bounds_and_next, way_names
+from trustbo.workspace.moves import bounds_along, pairs_along, way_names
 from trustbo.workspace.posts import SETS
 
 ENDS = (2, 0), (0, 2)
@@ -86,8 +86,8 @@ def test_the_change_by_the_next_way_is_that_of_the_line_of_sight(workspace):
 
 def test_ways_are_moves_with_a_set_of_posts():
     np.testing.assert_array_equal(bounds_along(ROUTE), [[2 + 8, 1, 1], [4, 1, 2], [1 + 16, 0, 2]])
-    plain = [cell[:2] for cell in ROUTE]
-    np.testing.assert_array_equal(bounds_and_next(ROUTE), bounds_and_next(plain))
+    expected = [[2 + 8, 1, 1, 4], [4, 1, 2, 1 + 16], [1 + 16, 0, 2, 24]]
+    np.testing.assert_array_equal(pairs_along(ROUTE, 3), expected)
 
 
 def test_a_mission_measures_the_awareness_of_its_posts(workspace):
