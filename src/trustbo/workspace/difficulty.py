@@ -189,7 +189,8 @@ class Difficulty:
             goals[:, k, -1] = posts.watching(c, None)
 
         one = np.ones((n_bounds, 1), bool)
-        worst = np.fmax(0.0, self._of_robot(team.lead, windows, *stops, one))  # NaN without a route
+        of_lead = self._of_robot(team.lead, windows, stops[0], stops[1], one)
+        worst = np.fmax(0.0, of_lead)  # NaN where the robot has no route
         for robot, start, goal in zip(team.robots, starts, goals, strict=True):
             worst = np.fmax(worst, self._of_robot(robot, windows, start, goal, follows))
         worst = worst.reshape(n_bounds, -1, len(MEASURES))
