@@ -115,7 +115,7 @@ def draw_risk(rng, of_posts, shape, n_posts, of_contact):
 
     The probabilities have shape (move, row, col), or (move, row, col, next_move) in half of the
     problems, which then depend on the next move. In three quarters of the problems with several
-    sets of posts, they also depend on the sets: moves, next moves, or both are ways.
+    sets of posts, the moves are ways, and so are four fifths of the next moves.
     """
     by_next = rng.random() < 0.5
     if n_posts > 1 and of_posts.random() < 0.75:

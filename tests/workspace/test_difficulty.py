@@ -330,3 +330,25 @@ def test_maps_by_way_and_by_option_have_the_same_values():
     pairs = np.column_stack([RNG.integers(n, size=50) for n in maps.shape[1:]])
     np.testing.assert_array_equal(by_bound[:, *options_of(pairs, 3).T], maps[:, *pairs.T])
     np.testing.assert_array_equal(by_option(maps[:, :8, ..., :9]), maps[:, :8, ..., :9])
+
+
+def test_the_tilt_tells_which_sets_robots_reach(with_sets):
+    """In the simulator, for bounds from one set to another, as above for the standard one."""
+    simulator = tb.simulation.KinematicSimulator(with_sets, team=team_of(8.0))
+    tilt = with_sets.difficulty.whole().values[..., TILT]
+    degrees = np.rad2deg(np.arctan(tilt * np.tan(np.deg2rad(11.0))))
+    clear = np.argwhere(np.abs(degrees - 8.0) > 0.5)
+    others = clear[(clear[:, 0] >= 8) & (clear[:, 3] < 24)]
+
+    chosen = np.random.default_rng(0).choice(others, 100, replace=False)
+    passed = []
+    for seed, (way, row, col, after) in enumerate(chosen.tolist()):
+        before, to = MOVES[way % 8], MOVES[after % 8]
+        a = row - before[0], col - before[1], POST_SETS[way // 8]
+        c = row, col, POST_SETS[after // 8]
+        mission = simulator.run([a, c, (row + to[0], col + to[1])], seed=seed)
+        passed.append(mission.statuses[0] == "ok")
+
+    is_below = degrees[tuple(chosen.T)] < 8.0
+    assert 0.1 < is_below.mean() < 0.9
+    assert np.mean(np.array(passed) == is_below) > 0.95
