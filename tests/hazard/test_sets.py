@@ -5,6 +5,8 @@ import pytest
 import xarray as xr
 
 import trustbo as tb
+from trustbo.campaign.earlier import EarlierMissions
+from trustbo.campaign.folder import earlier_from_tree, earlier_to_tree
 from trustbo.data import POST_SETS
 from trustbo.errors import TrustboError
 from trustbo.hazard.model import fit_hazard
@@ -245,3 +247,9 @@ def test_a_campaign_with_sets_keeps_its_failures_and_says_with_which_posts(hilly
         stored = again.posterior["hazard"]
         assert stored["p_fail"].shape == (24, 5, 5, 25)
         assert stored["move"].values.tolist() == way_names(3)
+
+
+def test_lost_missions_of_earlier_campaigns_keep_their_sets():
+    lost = LostMission(((0, 0, "far"), (0, 1), (0, 2)), (0, 1))
+    earlier = EarlierMissions((mission(lost.path),), (lost,))
+    assert earlier_from_tree(earlier_to_tree(earlier)).lost == (lost,)

@@ -345,7 +345,7 @@ def earlier_from_tree(tree: xr.DataTree) -> EarlierMissions:
     lost = []
     records: list[dict[str, Any]] = json.loads(tree.attrs["lost"])
     for record in records:
-        path = tuple((row, col) for row, col in record["path"])
         where = record["where"]
+        path = tuple(map(tuple, record["path"]))
         lost.append(LostMission(path, None if where is None else tuple(where)))
     return EarlierMissions(tuple(missions_from_tree(tree)), tuple(lost))
