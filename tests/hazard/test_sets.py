@@ -5,8 +5,8 @@ import pytest
 import xarray as xr
 
 import trustbo as tb
-from trustbo.campaign.earlier import EarlierMissions
 from trustbo.campaign.folder import earlier_from_tree, earlier_to_tree
+from trustbo.campaign.state import EarlierMissions
 from trustbo.data import POST_SETS
 from trustbo.errors import TrustboError
 from trustbo.hazard.model import fit_hazard
