@@ -43,9 +43,10 @@ def informed_planner(planner: Planner, risk: BoundRisk) -> Planner:
     planner = planner.with_risk(risk)
     problem = planner.problem
     priced = problem.objective.of_contact and problem.failure_cost != 0.0
-    n_stopped = risk.past_failures_of_bounds[..., None]
     if priced:
         n_stopped = by_option(risk.past_failures)
+    else:
+        n_stopped = risk.past_failures_of_bounds[..., None]
     stopped = n_stopped + _ROUNDING >= _STOPPED
     if not stopped.any():
         return planner
