@@ -42,8 +42,12 @@ from world_set import World, worlds
 
 import trustbo as tb
 
+PLANNER = {"max_bounds": "shortest+4"}
+FAILURES = {"planner": {**PLANNER, "failure_cost": 9.0}}
+"""Failures cost the bounds of a shortest path, also before the first mission has failed."""
 METHODS: dict[str, dict[str, Any]] = {
     "trustbo": {},
+    "trustbo, failures cost": FAILURES,
     "running mean": {"policy": running_mean.greedy(), "model": tb.models.PooledTrust()},
     "residual process": {
         "policy": residual_process.ResidualProcess(),
@@ -52,6 +56,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "line of sight": {"policy": line_of_sight.LineOfSight(), "model": tb.models.PooledTrust()},
     "2 sets of posts": {"n_posts": 2},
     "3 sets of posts": {"n_posts": 3},
+    "3 sets, failures cost": {"n_posts": 3, **FAILURES},
 }
 """Arguments of `trustbo.iterate`, and `n_posts` of the workspace, keyed by method."""
 USUAL = (OURS, "running mean", "residual process", "line of sight")
@@ -60,7 +65,6 @@ COURSES = ("sw-ne", "nw-se")
 MISSIONS = 15
 MISSIONS_OF_0_5 = 10
 """Number of missions of the campaigns whose rows are in lost_0.5.csv."""
-PLANNER = {"max_bounds": "shortest+4"}
 LABELS = ["world", "kind", "course"]
 LEAST = 0.02
 """Contact lost, in bounds, that is added to both sides of a ratio; on some worlds none is lost."""
@@ -127,11 +131,9 @@ def rows_of(
 
 def campaign_of(world: World, course: str, method: str, n_missions: int) -> tb.Campaign:
     """Run a campaign of a method; baselines learn from each mission."""
-    options = copy.deepcopy(METHODS[method])
+    options = {"planner": PLANNER, **copy.deepcopy(METHODS[method])}  # policies learn
     workspace = world.workspace(n_posts=options.pop("n_posts", 1))
-    campaign = tb.Campaign(
-        workspace, *world.ends(course), seed=4, progress=False, planner=PLANNER, **options
-    )
+    campaign = tb.Campaign(workspace, *world.ends(course), seed=4, progress=False, **options)
     for _, mission in campaign.run(world.simulator(workspace), n_missions, progress=False):
         if isinstance(campaign.policy, PathPolicy):
             campaign.policy.learn(campaign, mission)
