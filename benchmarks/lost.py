@@ -185,7 +185,9 @@ def differences(ours: pd.DataFrame, other: pd.DataFrame) -> None:
     The ratio is that of the geometric means over worlds.
     """
     pairs = ours.merge(other, on=LABELS, suffixes=("", "_other"))
-    columns = "ours minus other [95 % by terrain]", "last four", "ratio", "first missions"
+    columns = ["ours minus other [95 % by terrain]", "last four", "ratio", "first missions"]
+    if "first_other" not in pairs:  # as in rows of version 0.5
+        columns.pop()
     table = Table("worlds", "n", *columns, first=26)
     for group, kinds in groups().items():
         some = pairs[pairs["kind"].isin(kinds)]
@@ -196,7 +198,7 @@ def differences(ours: pd.DataFrame, other: pd.DataFrame) -> None:
             {name: some[name] - some[f"{name}_other"] for name in ("lost", "lost_last_4")}
         )
         for name in ("lost", "first"):
-            if f"{name}_other" in some:  # the first mission is not in tables of version 0.5
+            if f"{name}_other" in some:
                 ratio = (some[name] + LEAST) / (some[f"{name}_other"] + LEAST)
                 less[f"ratio {name}"] = np.log(ratio)
         of_worlds = less.groupby(some["world"]).mean()

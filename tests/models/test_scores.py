@@ -6,6 +6,7 @@ import numpyro.distributions as dist
 import pytest
 from scipy import stats
 
+from trustbo.data import Mission
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.effects.place import matern
 from trustbo.models.scores import NormalScores
@@ -13,12 +14,26 @@ from trustbo.models.scores import NormalScores
 STEP = 1e-6
 
 
+SIGHT, FLOOR = 0.9, 0.4
+
+
 @pytest.fixture(scope="module")
-def scores():
+def observations():
+    """Missions whose bounds all have the same predicted line of sight."""
+    sight = np.full((6, 2, 1), SIGHT)
+    path = [(0, k) for k in range(7)]
+    features = ["line_of_sight"]
+    mission = Mission.from_arrays(path, sight, sight[..., 0], features=features)
+    effects = (PlaceEffect(f_e=FLOOR), RobotEffect())
+    return PooledTrust(effects=effects).observations([mission])
+
+
+@pytest.fixture(scope="module")
+def scores(observations):
     """NormalScores of the two noises and of the hyperparameters of a place effect."""
     noises = {"delta_w": dist.HalfNormal(0.2), "delta_v": dist.HalfNormal(0.1)}
-    place = PlaceEffect()
-    return NormalScores(noises | place.hyperpriors(), place.pairs)
+    place = PlaceEffect(f_e=FLOOR)
+    return NormalScores(noises | place.hyperpriors(), place.pairs(observations))
 
 
 def log_prior_of_values(scores, z):
@@ -52,11 +67,12 @@ def test_sizes_and_angles_of_a_half_normal_pair_give_back_the_pair(scores):
     values = scores.values(z)
     of_neighbour = matern(1.0, 2.0)  # the median length scale
     sd = np.sqrt(1.0 - of_neighbour**2)
-    np.testing.assert_allclose(values["tau_s"], 0.2 * first / sd, rtol=1e-9)
+    g = np.sqrt(FLOOR**2 + (1.0 - FLOOR**2) * 4.0 * SIGHT * (1.0 - SIGHT))  # of the effects e
+    np.testing.assert_allclose(values["tau_s"], 0.2 * first * g / sd, rtol=1e-9)
     np.testing.assert_allclose(values["tau_e"], 0.2 * second, rtol=1e-9)
 
 
-def test_each_effect_with_two_standard_deviations_has_a_size():
-    model = PooledTrust(effects=(PlaceEffect(), RobotEffect()))
-    pairs = [(pair.first, pair.second) for effect in model.effects for pair in effect.pairs]
+def test_each_effect_with_two_standard_deviations_has_a_size(observations):
+    effects = (PlaceEffect(), RobotEffect())
+    pairs = [(one.first, one.second) for effect in effects for one in effect.pairs(observations)]
     assert pairs == [("tau_s", "tau_e"), ("tau_slow", "tau_mission")]

@@ -203,7 +203,7 @@ class TrustModel(Summary, ABC):
 
     def scores(self, observations: Observations) -> NormalScores:
         """Return the normal scores of all hyperparameters."""
-        pairs = [pair for effect in self.effects for pair in effect.pairs]
+        pairs = [pair for effect in self.effects for pair in effect.pairs(observations)]
         return NormalScores(self.all_hyperpriors(observations), pairs)
 
     def theta(self, values: Mapping[str, Any], resolution: float) -> dict[str, Any]:

@@ -144,9 +144,8 @@ class Effect:
         """Return the effect for these features; `of_rates` is false if trust is a logit."""
         return self
 
-    @property
-    def pairs(self) -> list[Pair]:
-        """The pair of standard deviations that add up to one variance, if there is one, in a list.
+    def pairs(self, observations: Observations) -> list[Pair]:
+        """Return the pair of standard deviations that add up to one variance, if any, in a list.
 
         Samplers then use their common size as a coordinate; see `scores`.
         """

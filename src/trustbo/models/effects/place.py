@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -105,10 +106,18 @@ class PlaceEffect(Effect):
         length_scale = dist.LogNormal(np.log(self.length_scale), self.length_scale_sd)
         return super().hyperpriors() | {"length_scale": length_scale}
 
-    @property
-    def pairs(self) -> list[Pair]:
-        """See `Effect.pairs`; data mostly determine differences of s between neighbours."""
-        return [Pair("tau_s", "tau_e", "length_scale", _sd_given_neighbour)]
+    def pairs(self, observations: Observations) -> list[Pair]:
+        """See `Effect.pairs`; data mostly determine differences of s between neighbours.
+
+        The effects e of visited bounds have the standard deviation tau_e times the mean square root
+        of g^2, so that s divided by this mean is compared with tau_e.
+        """
+        scale = 1.0
+        if observations.visited is not None:  # draws from the prior have no places
+            g = scale_at(_variation(observations), self.f_e)
+            scale = float(np.sqrt((g**2).mean()))
+        factor = partial(_relative_sd, scale=scale)
+        return [Pair("tau_s", "tau_e", "length_scale", factor)]
 
     def add_data(
         self, observations: Observations, missions: Sequence[Mission], on: Workspace | None
@@ -238,11 +247,11 @@ def _inverse(A: Any) -> Any:
     return H + np.swapaxes(np.triu(H, 1), 1, 2)
 
 
-def _sd_given_neighbour(length_scale: Any) -> Any:
-    """Compute the standard deviation of s / tau_s in a cell given s in a neighbouring cell."""
+def _relative_sd(length_scale: Any, *, scale: float) -> Any:
+    """Compute the sd of s / tau_s in a cell given s in a neighbouring cell, divided by `scale`."""
     xp: Any = namespace(length_scale)
     correlation = matern(1.0, xp.clip(length_scale, *_LENGTH_SCALES))
-    return xp.sqrt(xp.maximum((1.0 - correlation) * (1.0 + correlation), _JITTER))
+    return xp.sqrt(xp.maximum((1.0 - correlation) * (1.0 + correlation), _JITTER)) / scale
 
 
 def contrasts(n: int) -> np.ndarray:

@@ -67,8 +67,7 @@ class RobotEffect(Effect):
             priors["tau_lasting"] = dist.HalfNormal(self.tau_lasting)
         return priors
 
-    @property
-    def pairs(self) -> list[Pair]:
+    def pairs(self, observations: Observations) -> list[Pair]:
         """See `Effect.pairs`."""
         return [Pair("tau_slow", "tau_mission")]
 
