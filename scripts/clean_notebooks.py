@@ -2,8 +2,8 @@
 
     python scripts/clean_notebooks.py notebooks/*.ipynb
 
-The script removes run times, progress bars and local paths. It also reduces figures to a palette of
-256 colours if this hardly changes a pixel.
+The script removes run times, progress bars, messages about progress and local paths. It also
+reduces figures to a palette of 256 colours if this hardly changes a pixel.
 """
 
 import base64
@@ -18,6 +18,14 @@ from PIL import Image
 
 MAX_CHANGE = 8
 """Largest accepted change of a colour value (0 to 255) in 99 % of the pixels."""
+BAR = re.compile(r"\d+%\|")
+SAID = re.compile(
+    r"^[^\n]*"
+    r"\((?:a few seconds|about 20 s at first use|minutes on large grids|stored for later)\)\.\n"
+    r"|^[^\n]*TqdmWarning[^\n]*\n(?: [^\n]*\n)?",
+    flags=re.M,
+)
+"""Lines that depend on the speed of the machine, and the warning that bars will be plain text."""
 
 
 def smaller(png: str) -> str:
@@ -33,11 +41,11 @@ def smaller(png: str) -> str:
     return found if len(found) < len(png) else png
 
 
-def is_progress(output: dict) -> bool:
-    """Return whether an output is a progress bar or a message about bars or compilation."""
-    text = "".join(output.get("text", []))
-    about = text.startswith("compiling kernels") or "TqdmWarning" in text
-    return about or bool(re.fullmatch(r"(\r[^\n]*)+", text))
+def without_progress(text: str) -> str:
+    """Return a text of stderr without progress bars and what trustbo says while it computes."""
+    text = "".join(part for part in text.split("\r") if not BAR.search(part))
+    text = SAID.sub("", text)
+    return text if text.strip() else ""
 
 
 def clean(path: Path) -> None:
@@ -46,7 +54,11 @@ def clean(path: Path) -> None:
     for cell in notebook["cells"]:
         cell["metadata"].pop("execution", None)
         if "outputs" in cell:
-            cell["outputs"] = [output for output in cell["outputs"] if not is_progress(output)]
+            for output in cell["outputs"]:
+                if output.get("name") == "stderr":
+                    kept = without_progress("".join(output["text"]))
+                    output["text"] = kept.splitlines(keepends=True)
+            cell["outputs"] = [output for output in cell["outputs"] if output.get("text") != []]
         for output in cell.get("outputs", []):
             if "text" in output:  # shorten local paths
                 text = "".join(output["text"])
