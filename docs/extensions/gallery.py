@@ -24,7 +24,7 @@ _DPI = 110
 _NOTEBOOKS = (
     "Jupyter notebooks with their outputs; `make jupyter` installs JupyterLab and opens copies."
 )
-_PICTURES = {"compare_models": 3}
+_PICTURES = {"compare_models": 4}
 """Index of the stored picture of a notebook that is shown; by default, the first one."""
 _START, _GOAL = (7, 0), (0, 5)
 _SCRUB = (2, 1)
