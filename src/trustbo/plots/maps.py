@@ -203,7 +203,7 @@ def terrain_maps(workspace: Workspace, *, ax: Any = None) -> np.ndarray:
 
     height = terrain["dsm"].values
     surface.imshow(height, cmap="cividis", extent=extent)
-    surface.set_title(f"surface (DSM)\n{np.nanmin(height):.0f} to {np.nanmax(height):.0f} m")
+    surface.set_title(f"surface (DSM)\n{np.nanmin(height):z.0f} to {np.nanmax(height):z.0f} m")
     draw_contours(surface, workspace, "black", 0.25)
 
     for panel, name in zip(others, workspace.features, strict=True):
