@@ -74,8 +74,8 @@ _FLOOR = tb.models.Priors.from_features(["line_of_sight"]).f_v
 MODELS: dict[str, Any] = {
     "default": lambda features: tb.models.default_model(),
     "as in 0.5": as_in_0_5(),
-    "scales": as_in_0_5(f_e=0.3, f_v=_FLOOR),
-    "scale of effects": as_in_0_5(f_e=0.3),
+    "scales": as_in_0_5(f_e=0.02, f_v=_FLOOR),
+    "scale of effects": as_in_0_5(f_e=0.02),
     "lasting part": as_in_0_5(tau_lasting=0.3),
 }
 """Models that can be compared for given features, keyed by name."""

@@ -413,7 +413,9 @@ def _finite(log_p: np.ndarray) -> np.ndarray:
 
 
 def smoothed(log_ratio: np.ndarray, relative: float = 1.0) -> tuple[np.ndarray, float, float]:
-    """Smooth log importance ratios (point,) with a Pareto tail; at least one must be finite.
+    """Smooth log importance ratios (point,) with a Pareto tail.
+
+    If no ratio is finite, all weights are equal, and k-hat is infinite.
 
     Args:
         log_ratio: Log importance ratios.
@@ -424,9 +426,13 @@ def smoothed(log_ratio: np.ndarray, relative: float = 1.0) -> tuple[np.ndarray, 
         Weights that sum to 1, k-hat, and the log of the mean ratio.
     """
     finite = np.isfinite(log_ratio)
+    equal = np.full(len(log_ratio), 1.0 / len(log_ratio))
+    if not finite.any():
+        return equal, np.inf, -np.inf
+
     log_mean = float(special.logsumexp(log_ratio) - np.log(len(log_ratio)))
     if finite.all() and np.ptp(log_ratio) < _EVEN:  # equal weights have no tail
-        return np.full(len(log_ratio), 1.0 / len(log_ratio)), -np.inf, log_mean
+        return equal, -np.inf, log_mean
 
     # Vehtari et al. (2024), as implemented in ArviZ, which takes log likelihoods: the sign is the
     # opposite.

@@ -69,10 +69,10 @@ class PlaceEffect(Effect):
         tau_r: Scale of the half-normal prior on the standard deviation of r.
         length_scale: Median of the log-normal prior on the length scale of s, in cells.
         length_scale_sd: Prior standard deviation of the log length scale.
-        f_e: Floor f_e of the scale, from 0 to 1. With 1, all bounds have the same scale.
+        f_e: Floor f_e of the scale, at most 1. With 1, all bounds have the same scale.
 
     Raises:
-        TrustboError: If a setting is not positive, or `f_e` is not from 0 to 1.
+        TrustboError: If a setting is not positive, or `f_e` is above 1.
 
     Example:
         >>> model = tb.models.PooledTrust(effects=[tb.models.PlaceEffect(tau_s=0.4)])
@@ -85,7 +85,7 @@ class PlaceEffect(Effect):
     tau_r: float = 0.1
     length_scale: float = 2.0
     length_scale_sd: float = 0.5
-    f_e: float = 0.3
+    f_e: float = 0.02
     names = ("tau_s", "length_scale", "tau_e", "tau_r")
     group = "places"
     # The axes are defined in `place_maps.place_group`.
@@ -95,7 +95,8 @@ class PlaceEffect(Effect):
         super().__post_init__()
         sd = require_positive("PlaceEffect.length_scale_sd", self.length_scale_sd)
         object.__setattr__(self, "length_scale_sd", sd)
-        object.__setattr__(self, "f_e", require_share("PlaceEffect.f_e", self.f_e))
+        f_e = require_share("PlaceEffect.f_e", require_positive("PlaceEffect.f_e", self.f_e))
+        object.__setattr__(self, "f_e", f_e)
 
     def for_features(self, features: Sequence[str], *, of_rates: bool) -> Self:
         """See `Effect.for_features`; the floor is 1 if trust is a logit."""
