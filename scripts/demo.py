@@ -140,13 +140,13 @@ def draw_bound(ax: Axes, plan: tb.planning.Plan) -> None:
     low, high = seen.min(0) - 2.0, seen.max(0) + 2.0
     height = 1.4 * max(high[1] - low[1], (high[0] - low[0]) / ASPECT)  # with room for the legend
     x = (low[0] + high[0] - ASPECT * height) / 2.0
-    ax.set(xlim=(x, x + ASPECT * height), ylim=(high[1] - height, high[1]))
+    ax.set(xlim=(x, x + ASPECT * height), ylim=(low[1], low[1] + height))
     ax.set_title("(a) a bound")
     legend = {
         "T1, the lead": lead, "1. T1 moves": moves, "T2 at overwatch points": watches,
         "T2 watches": sight[0], "2. T2 closes up": follows,
     }  # fmt: skip
-    ax.legend(legend.values(), legend.keys(), loc="lower left", fontsize=8)
+    ax.legend(legend.values(), legend.keys(), loc="upper left", fontsize=8)
     draw_scale(ax)
 
 
