@@ -252,7 +252,7 @@ class Problem:
 
     @cached_property
     def edge_risks(self) -> "EdgeRisks | None":
-        """EdgeRisks of the bounds in the form of the search; None if plans do not depend on risk.
+        """Log risks of the edges in the form of the search; None if plans do not depend on risk.
 
         Raises:
             TrustboError: If `max_failure` is set without a risk, or `p_fail` of a bound is NaN.
@@ -403,7 +403,7 @@ class Problem:
 
 
 class EdgeRisks(NamedTuple):
-    """EdgeRisks -log(1 - p_fail) of the bounds, which the search sums along a path.
+    """Log risks -log(1 - p_fail) of the edges, which the search sums along a path.
 
     `of_edges` (edge, component) contains the risk of the bound of each edge of `paths.committed`,
     with one column per component of the risk. If the risks of a path add up to r_m in
