@@ -110,13 +110,12 @@ class PlaceEffect(Effect):
     def pairs(self, observations: Observations) -> list[Pair]:
         """See `Effect.pairs`; data mostly determine differences of s between neighbours.
 
-        The effects e of visited bounds have the standard deviation tau_e times the mean square root
-        of g^2, so that s divided by this mean is compared with tau_e.
+        Over visited bounds, the effects e have the standard deviation tau_e times the root mean
+        square of g, so s divided by this root is compared with tau_e.
         """
         scale = 1.0
         if observations.visited is not None:  # draws from the prior have no places
-            g = scale_at(_variation(observations), self.f_e)
-            scale = float(np.sqrt((g**2).mean()))
+            scale = float(np.sqrt((self._scale(observations) ** 2).mean()))
         factor = partial(_relative_sd, scale=scale)
         return [Pair("tau_s", "tau_e", "length_scale", factor)]
 
@@ -157,7 +156,7 @@ class PlaceEffect(Effect):
         """Return a Gaussian-process prior on cells and independent priors on bounds."""
         xp: Any = namespace(theta["tau_e"])
         places: Any = observations.visited
-        g = scale_at(_variation(observations), self.f_e)
+        g = self._scale(observations)
         sd = xp.maximum(g * theta["tau_e"][:, None], LEAST)
         of_bounds = _precision_of_bounds(sd, _same_bound(places))
         of_robot = xp.maximum(g * theta["tau_r"][:, None], LEAST) ** -2.0
@@ -165,6 +164,10 @@ class PlaceEffect(Effect):
 
         of_cells = [self._cells(theta, square) for square in places.squares]
         return None, [*of_cells, of_bounds, of_robots]
+
+    def _scale(self, observations: Observations) -> np.ndarray:
+        """Return the scale g of the effects in each visited bound, shape (bound,)."""
+        return scale_at(_variation(observations), self.f_e)
 
     def _cells(self, theta: Theta, square: np.ndarray) -> Any:
         """Compute the precision (point, cell, cell) of s from squared distances (cell, cell)."""
