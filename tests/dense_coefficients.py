@@ -306,7 +306,9 @@ def place_prior(effect, observations, theta, bounds, gain):
     n_contrasts = observations.contact_rate.shape[2] - 1
     sight = line_of_sight(observations)
     of_bounds = [sight[(bounds == bound).all(-1)].mean() for bound in places]
-    g = scale_of(np.array(of_bounds), floor_of(effect, observations))
+    floor = floor_of(effect, observations)
+    g = scale_of(np.array(of_bounds), floor)
+    of_robots = scale_of(np.array(of_bounds), max(floor, 0.1))
     distance = np.linalg.norm(cells[:, None] - cells, axis=2)
     h = np.sqrt(3.0) * distance / theta["length_scale"]
     matern = (1.0 + h) * np.exp(-h) + NUGGET * np.eye(len(cells))
@@ -315,7 +317,7 @@ def place_prior(effect, observations, theta, bounds, gain):
         (np.zeros(len(g)), theta["tau_e"] ** 2 * np.outer(g, g) * between_posts(places)),
         (
             np.zeros(len(g) * n_contrasts),
-            theta["tau_r"] ** 2 * np.diag(np.repeat(g**2, n_contrasts)),
+            theta["tau_r"] ** 2 * np.diag(np.repeat(of_robots**2, n_contrasts)),
         ),
     ]
 

@@ -265,6 +265,17 @@ def test_prior_draws_of_the_first_mission_have_effects_of_places_and_robots():
     np.testing.assert_array_equal(again.place, draws.place)
 
 
+@pytest.mark.parametrize(("f_e", "f_r"), [(0.02, 0.1), (0.4, 0.4), (1.0, 1.0)])
+def test_robots_differ_by_at_least_a_tenth_where_the_map_predicts_whole_contact(f_e, f_r):
+    sight = np.ones((3, 8, 4, 5, 1))
+    workspace = tb.Workspace.from_awareness(sight, features=("line_of_sight",))
+    model = PooledTrust(effects=(PlaceEffect(tau_r=0.15, f_e=f_e),))
+    effects = sample_prior_ahead(model, workspace, 4000, 1).drawn.place_robot.everywhere()
+    expected = (f_r * 0.15) ** 2 * 2.0 / 3.0
+    inside = effects[..., 1:-1, 1:-1]  # bounds that enter other cells may come from outside
+    assert inside.var(0).mean() == pytest.approx(expected, rel=0.1)
+
+
 def test_mistakes_are_refused_before_sampling(missions):
     with pytest.raises(TrustboError):
         fit([])

@@ -24,7 +24,7 @@ from scipy.linalg import cho_factor, cho_solve
 from trustbo.arrays import joined_draws
 from trustbo.data import is_line_of_sight
 from trustbo.models.effects.effect import LEAST
-from trustbo.models.effects.place import BETWEEN_POSTS, matern
+from trustbo.models.effects.place import BETWEEN_POSTS, floor_of_robots, matern
 from trustbo.models.robots_in_bounds import RobotsInBounds
 from trustbo.models.sight_scale import scale_at, variation
 from trustbo.models.visited import Visited
@@ -67,7 +67,7 @@ def place_group(
         places: Visited places. If some are not on the map of the workspace, the coordinates
             `cell_map` and `bound_map` contain the numbers of the maps, 0 for the workspace.
         robots: Names of the robots.
-        f_e: Floor of the scale of effects in bounds; see `PlaceEffect`.
+        f_e: Floor of the scale of effects e; see `PlaceEffect`.
         seed: Random seed for the maps that `params_of` draws.
     """
     variables = {
@@ -162,7 +162,7 @@ def robots_in_bounds_of(
         known=known,
         column=column,
         tau_r=tau_r,
-        scale=scale_at(variation(sight), group.attrs["f_e"]),
+        scale=scale_at(variation(sight), floor_of_robots(group.attrs["f_e"])),
         number=np.arange(len(tau_r)),
         seed=seed,
     )

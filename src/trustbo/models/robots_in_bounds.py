@@ -15,7 +15,7 @@ class RobotsInBounds(NamedTuple):
 
     In visited bounds, the effects are posterior draws. In all other bounds, they are independent
     draws from the prior, g tau_r (n_i - mean n) with standard normal n_i for robot i and the scale
-    g of `PlaceEffect`. An array of the draws in all bounds would be larger than all other
+    g = g(f_r) of `PlaceEffect`. An array of the draws in all bounds would be larger than all other
     parameters together, by a factor equal to the number of robots. Therefore, n_i is computed from
     the numbers of the draw, the robot and the bound when it is needed.
 

@@ -25,6 +25,9 @@ _JITTER = 1e-8  # added to the correlation matrix of cells
 _LENGTH_SCALES = (1e-6, 1e6)  # limits in cells, where cells are independent or equal
 BETWEEN_POSTS = 0.5
 """Correlation of the effects e of a bound between different sets of posts."""
+_LEAST_F_R = 0.1
+"""Least floor f_r of the scale of r. With smaller ones, few robots in bounds with whole contact
+decide about tau_r, and posteriors have two modes."""
 
 
 @dataclass(frozen=True)
@@ -36,17 +39,18 @@ class PlaceEffect(Effect):
         u_i(a -> c) = beta . z_i(a -> c) + b + s(c) + e(a -> c) + r_i(a -> c)
 
     Here s is a Gaussian process over cells with standard deviation tau_s and a Matern 3/2
-    covariance. The effects e(a -> c) ~ N(0, g^2 tau_e^2) of directed bounds are independent. The
-    effects r_i of robots in a bound sum to 0 over the robots: for n robots, they have the
-    covariance g^2 tau_r^2 (I - 1/n).
+    covariance. The effects e(a -> c) ~ N(0, g(f_e)^2 tau_e^2) of directed bounds are independent.
+    The effects r_i of robots in a bound sum to 0 over the robots: for n robots, they have the
+    covariance g(f_r)^2 tau_r^2 (I - 1/n).
 
     The scale g depends on the mean m of the robots' predicted line of sight in the bound, because
     the map errs less where it predicts no contact or whole contact ::
 
-        g^2 = f_e^2 + (1 - f_e^2) 4 m (1 - m)
+        g(f)^2 = f^2 + (1 - f^2) 4 m (1 - m)
 
-    The floor f_e is g where m is 0 or 1. Without a feature that predicts line of sight, and if
-    trust is a logit, all bounds have the same scale, 1.
+    The floor f is g where m is 0 or 1. That of robots, f_r = max(f_e, 0.1), is not smaller than
+    0.1, because robots also differ where the map is right about the team. Without a feature that
+    predicts line of sight, and if trust is a logit, all bounds have the same scale, 1.
 
     The map is simply wrong about a few bounds. If f_e is below 1, 5 % of the draws of e in a bound
     that was never driven are therefore half-normal with scale 3 tau_e, and move trust towards 0.5.
@@ -69,7 +73,7 @@ class PlaceEffect(Effect):
         tau_r: Scale of the half-normal prior on the standard deviation of r.
         length_scale: Median of the log-normal prior on the length scale of s, in cells.
         length_scale_sd: Prior standard deviation of the log length scale.
-        f_e: Floor f_e of the scale, at most 1. With 1, all bounds have the same scale.
+        f_e: Floor f_e of the scale of e, at most 1. With 1, all bounds have the same scale.
 
     Raises:
         TrustboError: If a setting is not positive, or `f_e` is above 1.
@@ -156,17 +160,17 @@ class PlaceEffect(Effect):
         """Return a Gaussian-process prior on cells and independent priors on bounds."""
         xp: Any = namespace(theta["tau_e"])
         places: Any = observations.visited
-        g = self._scale(observations)
-        sd = xp.maximum(g * theta["tau_e"][:, None], LEAST)
+        sd = xp.maximum(self._scale(observations) * theta["tau_e"][:, None], LEAST)
         of_bounds = _precision_of_bounds(sd, _same_bound(places))
-        of_robot = xp.maximum(g * theta["tau_r"][:, None], LEAST) ** -2.0
+        g_r = scale_at(_variation(observations), floor_of_robots(self.f_e))
+        of_robot = xp.maximum(g_r * theta["tau_r"][:, None], LEAST) ** -2.0
         of_robots = xp.repeat(of_robot, observations.n_robots - 1, axis=1)
 
         of_cells = [self._cells(theta, square) for square in places.squares]
         return None, [*of_cells, of_bounds, of_robots]
 
     def _scale(self, observations: Observations) -> np.ndarray:
-        """Return the scale g of the effects in each visited bound, shape (bound,)."""
+        """Return the scale g(f_e) of the effects e in each visited bound, shape (bound,)."""
         return scale_at(_variation(observations), self.f_e)
 
     def _cells(self, theta: Theta, square: np.ndarray) -> Any:
@@ -256,6 +260,11 @@ def _relative_sd(length_scale: Any, *, scale: float) -> Any:
     xp: Any = namespace(length_scale)
     correlation = matern(1.0, xp.clip(length_scale, *_LENGTH_SCALES))
     return xp.sqrt(xp.maximum((1.0 - correlation) * (1.0 + correlation), _JITTER)) / scale
+
+
+def floor_of_robots(f_e: float) -> float:
+    """Return the floor f_r of the scale of r, given that of e."""
+    return max(f_e, _LEAST_F_R)
 
 
 def contrasts(n: int) -> np.ndarray:
