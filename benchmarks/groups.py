@@ -1,6 +1,6 @@
-"""Paired comparisons of methods by group and kind of world, and comparison with version 0.4.
+"""Paired comparisons of methods by group and kind of world, and comparison with version 0.5.
 
-    python benchmarks/groups.py           # of the stored table of version 0.5
+    python benchmarks/groups.py           # of the stored table
     python benchmarks/groups.py rows.csv  # of another table
 
 The results are from benchmarks/worlds.py. A row (see `rows_of`) is the mean over seeds of one
@@ -39,9 +39,9 @@ GROUPS = {
 LOST = "lost_with_failures"
 COLUMNS = ["lost_while_learning", "regret_now", "arrive", LOST, "arrive_first_3", "arrive_later"]
 """Quantities of a row."""
-STORED = Path(__file__).parent / "reference" / "worlds_0.5.csv"
-BEFORE = Path(__file__).parent / "reference" / "worlds_0.4.csv"
-"""Rows of version 0.4, on the worlds that it knew."""
+STORED = Path(__file__).parent / "reference" / "worlds_0.6.csv"
+BEFORE = Path(__file__).parent / "reference" / "worlds_0.5.csv"
+"""Rows of version 0.5."""
 NAMES = {
     "case": "method", "lost while learning": "lost_while_learning", "regret now": "regret_now",
     "lost with failures": LOST, "arrive of the first 3": "arrive_first_3",
@@ -187,9 +187,9 @@ def by_limit(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def beside(rows: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
-    """Compute the contact lost now minus that of version 0.4, on the same worlds and courses."""
+    """Compute the contact lost now minus that of version 0.5, on the same worlds and courses."""
     ours = [table[table["method"] == OURS] for table in (rows, reference)]
-    both = ours[0].merge(ours[1], on=["world", "kind", "course"], suffixes=("", "_0.4"))
+    both = ours[0].merge(ours[1], on=["world", "kind", "course"], suffixes=("", "_before"))
     groups = GROUPS | {kind: (kind,) for kind in KINDS}
 
     table = []
@@ -198,21 +198,21 @@ def beside(rows: pd.DataFrame, reference: pd.DataFrame) -> pd.DataFrame:
         if some.empty:
             continue
 
-        less = (some[LOST] - some[f"{LOST}_0.4"]).to_numpy()
+        less = (some[LOST] - some[f"{LOST}_before"]).to_numpy()
         found = clustered(less, grounds_of(some["world"]))
 
-        means = some[f"{LOST}_0.4"].mean(), some[LOST].mean()
-        regret = some["regret_now_0.4"].mean(), some["regret_now"].mean()
-        arrive = some["arrive_0.4"].mean(), some["arrive"].mean()
+        means = some[f"{LOST}_before"].mean(), some[LOST].mean()
+        regret = some["regret_now_before"].mean(), some["regret_now"].mean()
+        arrive = some["arrive_before"].mean(), some["arrive"].mean()
         table.append([name, some["world"].nunique(), *means, *found, *regret, *arrive])
 
-    head = ["what", "n", "0.4", "now", "value", "low", "high", "p"]
-    head += ["regret_0.4", "regret", "arrive_0.4", "arrive"]
+    head = ["what", "n", "0.5", "now", "value", "low", "high", "p"]
+    head += ["regret_before", "regret", "arrive_before", "arrive"]
     return pd.DataFrame(table, columns=head)
 
 
 def report_groups(rows: pd.DataFrame) -> None:
-    """Print Markdown tables by group and kind, of arrivals, and compared with version 0.4."""
+    """Print Markdown tables by group and kind, of arrivals, and compared with version 0.5."""
     print_groups(by_group(rows))
     print_kinds(by_kind(rows))
     print_arrivals(arrivals(rows), methods_in(rows))
@@ -272,13 +272,13 @@ def print_limits(limits: pd.DataFrame, methods: Sequence[str]) -> None:
 
 def print_compared(compared: pd.DataFrame) -> None:
     """Print the table of `beside`."""
-    print(f"\n**{OURS} compared with version 0.4**: lost on the same worlds and courses\n")
+    print(f"\n**{OURS} compared with version 0.5**: lost on the same worlds and courses\n")
     table = Table(
-        "worlds", "0.4", "now", "difference [95 %]", "p", "final regret (%), 0.4", "now",
-        "arrive, 0.4", "now",
+        "worlds", "0.5", "now", "difference [95 %]", "p", "final regret (%), 0.5", "now",
+        "arrive, 0.5", "now",
     )  # fmt: skip
 
-    pairs = ("0.4", "now"), ("regret_0.4", "regret"), ("arrive_0.4", "arrive")
+    pairs = ("0.5", "now"), ("regret_before", "regret"), ("arrive_before", "arrive")
     for _, row in compared.iterrows():
         means, regret, arrive = ([f"{row[name]:.3f}" for name in pair] for pair in pairs)
         what = f"{row['what']} ({row['n']})"

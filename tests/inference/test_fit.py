@@ -276,6 +276,29 @@ def test_robots_differ_by_at_least_a_tenth_where_the_map_predicts_whole_contact(
     assert inside.var(0).mean() == pytest.approx(expected, rel=0.1)
 
 
+def test_censored_rates_that_are_mostly_zero_are_fitted():
+    """EP at the mode alone gives uneven weights here (k-hat 1.6 or more with five seeds)."""
+    rng = np.random.default_rng(4)
+    missions = []
+    for _ in range(2):
+        x, rates = np.full(4, -0.4), []
+        for _ in range(30):
+            x = 0.2 * x - 0.28 + 0.3 * rng.standard_normal(4)
+            rates.append(np.clip(np.round(20.0 * (x + 0.1 * rng.standard_normal(4))) / 20.0, 0, 1))
+        missions.append(
+            tb.Mission.from_arrays(None, np.zeros((30, 4, 1)), np.array(rates), n_ticks=20)
+        )
+    posterior = fit(missions, PooledTrust(family="censored"), latent=False, progress=False)
+    assert posterior.attrs["k_hat"] < 0.7
+    trust = posterior["posterior"]
+    stationary = trust["b"] / (1.0 - trust["beta0"])
+    low, high = stationary.quantile([0.05, 0.95]).values
+    assert low < -0.35 < high
+    total = np.hypot(trust["delta_w"], trust["delta_v"])
+    low, high = total.quantile([0.05, 0.95]).values
+    assert low < np.hypot(0.3, 0.1) < high
+
+
 def test_mistakes_are_refused_before_sampling(missions):
     with pytest.raises(TrustboError):
         fit([])

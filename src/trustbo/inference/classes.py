@@ -44,7 +44,10 @@ _NEGLIGIBLE = 0.01
 _SIZE = 256
 """Points per round of the importance sampler."""
 _LAST_SIZE = 1024
-"""Points per round of the last attempt."""
+"""Points per round of the last attempt, if rates are Gaussian."""
+_CORRECTIONS = 4
+"""Number of draws of the coefficients by which EP is corrected at each point in the last attempt,
+if rates are not Gaussian."""
 _MANY_SCORES = 13
 """Smallest number of scores for which a round has four times as many points."""
 _CHUNK = 32
@@ -135,7 +138,8 @@ def by_importance(
     found by a search for the mode.
     """
     rng = np.random.default_rng(seed)
-    attempts = [(_SIZE, None), (_LAST_SIZE, None)]
+    last_size = _LAST_SIZE if density.is_gaussian else _SIZE
+    attempts = [(_SIZE, None), (last_size, None)]
     if first:
         attempts = [(_SIZE, first), *attempts]
     while True:
@@ -143,7 +147,8 @@ def by_importance(
         if density.n_scores >= _MANY_SCORES:
             size = 4 * size
 
-        drawn, log_p, summary = _draws(density, n, size, rng, proposal)
+        corrections = 1 if attempts else _CORRECTIONS
+        drawn, log_p, summary = _draws(density, n, size, rng, proposal, corrections)
         if summary["k_hat"] <= MAX_KHAT or not attempts:
             return drawn, {"lp": log_p}, summary
 
@@ -154,8 +159,14 @@ def _draws(
     size: int,
     rng: np.random.Generator,
     first: Student | None,
+    corrections: int,
 ) -> tuple[JointDraws, np.ndarray, dict[str, Any]]:
-    """Take n draws, beginning with the proposal `first` or with a search for the mode."""
+    """Take n draws, beginning with the proposal `first` or with a search for the mode.
+
+    Unless rates are Gaussian, the density of EP is corrected at the points in the end. With several
+    `corrections`, EP is run and corrected at each visited point instead, so that later proposals
+    are fitted to the corrected density.
+    """
     if first is None:
         start = density.start()
     else:
@@ -163,10 +174,19 @@ def _draws(
         density.run_ep(density.theta(start[None]))
 
     visited: list[Coefficients] = []
+    corrected: list[np.ndarray] = []
 
     def visit(z: np.ndarray) -> np.ndarray:
-        log_p, coefficients = density.visit(z, rng)
+        at_once = not density.is_gaussian and corrections > 1
+        log_p, coefficients = density.visit(z, rng, swept=at_once)
         visited.append(coefficients)
+        if not at_once:
+            return log_p
+
+        some = np.flatnonzero(np.isfinite(log_p))
+        correction, c = _correction(density, z, coefficients, some, rng, corrections)
+        log_p[some] = correction
+        corrected.append(c)
         return log_p
 
     points = sample(
@@ -179,6 +199,9 @@ def _draws(
     if density.is_gaussian:
         chosen = points.resample(n, rng)
         c = coefficients.draw(chosen, rng)
+    elif corrected:
+        chosen = points.resample(n, rng)
+        c = np.concatenate(corrected)[chosen]
     else:
         points, c = _corrected(density, points, coefficients, rng)
         chosen = points.resample(n, rng)
@@ -193,13 +216,36 @@ def _corrected(
     density: Density, points: Points, coefficients: Coefficients, rng: np.random.Generator
 ) -> tuple[Points, np.ndarray]:
     """Draw coefficients (point, column) at all points, and correct the weights for errors of EP."""
-    c, log_q = coefficients.propose(np.arange(len(points.z)), rng)
-
     some = np.flatnonzero(points.weight * len(points.z) > _NEGLIGIBLE)
+    log_p, c = _correction(density, points.z, coefficients, some, rng, 1)
+
     log_ratio = points.log_ratio.copy()
-    log_ratio[some] += density.log_joint(points.z[some], c[some], rng)
-    log_ratio[some] -= log_q[some] + points.log_p[some]
+    log_ratio[some] += log_p - points.log_p[some]
     return Points.from_log_weights(points.z, points.log_p, log_ratio, points.near), c
+
+
+def _correction(
+    density: Density,
+    z: np.ndarray,
+    coefficients: Coefficients,
+    some: np.ndarray,
+    rng: np.random.Generator,
+    n: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate the log density of `some` points (some,) with n draws of the coefficients of each.
+
+    The mean of the estimated densities is exact. Also return one of the draws at each point (point,
+    column), chosen by its weight; at other points, any draw.
+    """
+    proposed = [coefficients.propose(np.arange(len(z)), rng) for _ in range(n)]
+    log_p = np.array(
+        [density.log_joint(z[some], c[some], rng, swept=n > 1) - q[some] for c, q in proposed]
+    )
+    c = proposed[0][0]
+    if n > 1:
+        largest = (log_p + rng.gumbel(size=log_p.shape)).argmax(0)  # with probabilities by weight
+        c[some] = np.array([c for c, _ in proposed])[largest, some]
+    return logsumexp(log_p, axis=0) - np.log(n), c
 
 
 def _first_proposal(start: xr.DataTree | None, record: str) -> Student | None:

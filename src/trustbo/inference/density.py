@@ -35,6 +35,8 @@ _LEAST_NOISE = 1e-6
 """Smallest size of the noises whose density is computed."""
 _SWEEPS = 1
 """Number of EP sweeps at each point for an evidence, beginning with the sites at the mode."""
+_LAST_SWEEPS = 2
+"""The same, for coefficients where those of the sites at the mode give uneven weights."""
 _SETTLED = 12
 """Largest number of EP sweeps that find the sites at the mode."""
 _STEADY = 1e-3
@@ -184,15 +186,21 @@ class Density:
             log_p[some] += log_prior
         return np.where(np.isfinite(log_p), log_p, -np.inf)
 
-    def visit(self, z: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, Coefficients]:
-        """Compute the log density of `log_density` and the coefficients at each point."""
+    def visit(
+        self, z: np.ndarray, rng: np.random.Generator, *, swept: bool = False
+    ) -> tuple[np.ndarray, Coefficients]:
+        """Compute the log density of `log_density` and the coefficients at each point.
+
+        If `swept`, EP is run at each point, which gives coefficients that are closer to the
+        posterior; the log density is then that of rates equal to the sites.
+        """
         log_p = np.full(len(z), -np.inf)
         found = Coefficients.empty(len(z), self.columns.n)
 
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
             theta, log_prior, some = self.possible(z)
             for where, chunk in chunks(theta, self._n_at_once):
-                fit, prior = self._fit(chunk)
+                fit, prior = self._swept(chunk) if swept else self._fit(chunk)
                 log_p[some[where]] = fit.log_p
                 parts = coefficients_of(prior, fit, _DEVIATIONS, rng)
                 for values, part in zip(found, (*parts, fit.F.log_det), strict=True):
@@ -290,7 +298,9 @@ class Density:
         cov[others, others] = _PRIOR_VARIANCE
         return Student(center, np.linalg.cholesky(cov))
 
-    def log_joint(self, z: np.ndarray, c: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def log_joint(
+        self, z: np.ndarray, c: np.ndarray, rng: np.random.Generator, *, swept: bool = False
+    ) -> np.ndarray:
         """Estimate the log joint density (draw,) of scores, coefficients and rates.
 
         The linear predictors are drawn and weighted, so that the mean of the estimated densities is
@@ -300,13 +310,17 @@ class Density:
             z: Normal scores (draw, score).
             c: Coefficients (draw, column).
             rng: Random number generator.
+            swept: Whether EP is run at each draw, for more even weights.
         """
         theta = self.theta(z)
         log_p = self.scores.log_prior(z)
         for where, chunk in chunks(theta):
             joint = self._joint(chunk)
             at = expected(self.blocks, joint.predictor, c[where])
-            sites, _ = self.near.at(self.rates, joint.predictor.noise_sd)
+            if swept:
+                sites = ep.swept(joint, self.sites, _LAST_SWEEPS)
+            else:
+                sites, _ = self.near.at(self.rates, joint.predictor.noise_sd)
             _, log_block = ep.draw_predictors(joint, at, sites, rng)
             log_p[where] += joint.prior.log_density(c[where]) + log_block.sum(1)
         return log_p
@@ -328,6 +342,13 @@ class Density:
 
         predictor, prior = self.given(theta)
         return evidence(self.blocks, predictor, prior, self.rate_precision(predictor)), prior
+
+    def _swept(self, theta: Theta) -> tuple[Fit, Prior]:
+        """Fit the sites of EP at each theta; also return the prior."""
+        joint = self._joint(theta)
+        sites = ep.swept(joint, self.sites, _LAST_SWEEPS)
+        fit = evidence(self.blocks, joint.predictor, joint.prior, sites.lam, sites.y)
+        return fit, joint.prior
 
     def given(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
         """Return the distribution of the linear predictors and the prior at each theta."""
