@@ -262,6 +262,13 @@ class Result(Summary):
     ) -> xr.DataArray:
         """Compute how trustworthy a robot will be while the lead enters a cell.
 
+        Expected trust is carried over from bound to bound, so it depends on the path. Instead, this
+        method returns stationary trust, to which expected trust converges if a bound with the drift
+        u is repeated: u / (1 - beta0), (I - B0)^-1 u for `CoupledTrust`, or u if the model has
+        `memory="deviation"`. If no move is given, it is averaged over the bounds that enter the
+        cell. Stationary trust is an expected contact rate that is not limited to [0, 1] or, for the
+        family `"beta_binomial"`, the logit of a contact rate.
+
         The draws are those of the last posterior or, before anything was learned, of the prior.
         They contain the effects of places and of robots in the next mission.
 
@@ -278,11 +285,13 @@ class Result(Summary):
 
         Returns:
             Stationary trust of each posterior draw, as a DataArray with the dims (draw, robot, row,
-            col). If a robot or cell is given, its dims are left out. See `planning.Planner.trust`.
+            col). If a robot or cell is given, its dims are left out. Values are NaN where no bound
+            enters a cell and, with a warning, for draws in which trust diverges. See
+            `planning.Planner.trust`.
 
         Raises:
             TrustboError: The robot, move or set of posts is unknown, the cell is off the grid or
-                impassable, or no such bound enters the cell.
+                impassable, no such bound enters the cell, or trust diverges in all draws.
 
         Example:
             >>> trust = result.trust("r2", (3, 4))

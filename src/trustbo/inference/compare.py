@@ -37,11 +37,11 @@ def compare(
     """Rank posteriors by leave-one-mission-out cross-validation; see `loo` and `arviz.compare`.
 
     With few missions, LOO often cannot tell which model is better. The column `verdict` is
-    `"undecided"`, followed by the reason, if the difference from the best model is below 4 nats or
-    below two standard errors, or if there are fewer than 10 missions. The best model is also
-    `"undecided"`, without a reason, if another model is. If a verdict is undecided, do not use the
-    weights or the order of the models. `p`, the effective number of parameters, should be much
-    smaller than `n_missions`.
+    `"undecided"`, followed by the reason, if the difference from the best model is below 4 nats
+    (Sivula et al. 2025, arXiv:2008.10296) or, by rules of thumb of trustbo, below two standard
+    errors, or if there are fewer than 10 missions. The best model is also `"undecided"`, without a
+    reason, if another model is. If a verdict is undecided, do not use the weights or the order of
+    the models. `p`, the effective number of parameters, should be much smaller than `n_missions`.
 
     Args:
         posteriors: Two or more posteriors by name, fitted to the same missions. Each is from `fit`,
@@ -60,11 +60,17 @@ def compare(
     Returns:
         Table from `arviz.compare` with one row per posterior, the best first. The columns include
         `elpd`, `p`, `n_missions`, `elpd_diff` and its standard error `dse` (in nats), `verdict`,
-        the stacking `weight`, and `diag_elpd`, which reports a high Pareto k.
+        the stacking `weight`, and `diag_elpd`, which reports a high Pareto k. `p_worse` is the
+        probability that a model is worse than the best one, by a normal approximation of the
+        difference. `diag_diff` is the text of ArviZ for when this approximation is poor:
+        `"N < 100"` for fewer than 100 missions, `"|elpd_diff| < 4"`, or empty.
 
     Raises:
-        TrustboError: If there are fewer than two posteriors; if their rates or tick counts differ;
-            or if some log-likelihoods refer to tick counts and others to rates.
+        TrustboError: If there are fewer than two posteriors; if `models` has a name without a
+            posterior; if the rates or tick counts differ; if some log-likelihoods refer to tick
+            counts and others to rates; if a mission must be left out by a refit (see `loo`) but the
+            posterior is from `arviz.from_numpyro`; or if the model of a posterior is needed in
+            `models`, or is another one there.
 
     Example:
         >>> pooled = tb.fit(missions, tb.models.PooledTrust())

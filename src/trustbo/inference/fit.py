@@ -47,6 +47,11 @@ def fit(
 ) -> xr.DataTree:
     """Fit a trust model to missions, and return the posterior of parameters and latent trust.
 
+    This is Bayes' rule, equation (5) of Zheng et al. (2021, arXiv:2201.01878), with latent trust
+    integrated out where this is possible, and drawn afterwards. Importance weights are
+    Pareto-smoothed (PSIS; Vehtari et al. 2024, Journal of Machine Learning Research 25(72)), and
+    k-hat is the diagnostic of that paper.
+
     Args:
         missions: Missions of one team; NaN marks contact rates that were not measured.
         model: Trust model, or a NumPyro function `model(awareness, contact_rate=None)` (see
@@ -78,7 +83,8 @@ def fit(
         seed: Random seed; the same seed gives the same posterior.
         progress: Whether to show a progress bar; importance sampling shows it after 1.5 seconds.
         check: Whether to raise an error if the diagnostics are bad. For importance sampling, this
-            means k-hat > 0.7; for NUTS, R-hat > 1.01, bulk ESS < 400 or any divergence.
+            means k-hat > 0.7; for NUTS, R-hat > 1.01, bulk ESS < 400 or any divergence. The limits
+            for NumPyro functions are different; see the how-to "Your own model".
         latent: Whether to add latent trust, log-likelihoods and predictions, as `add_latent` does.
         start: Posterior of the same model given similar data, such as all missions but the last.
             Importance sampling then begins with the proposal of this posterior instead of a search
@@ -98,7 +104,10 @@ def fit(
     Raises:
         TrustboError: If there are no missions; robots or features differ between missions; an
             awareness value is NaN; the sampler is unknown; no contact rate was measured; a path
-            leaves the workspace; or a number of draws or the seed is not a whole number.
+            leaves the workspace; or a number of draws or the seed is not a whole number. Also if a
+            NumPyro function breaks a rule of the how-to "Your own model": for example, if its site
+            `contact_rate` is missing, not observed or not a `ContactRate`, if the drift has another
+            shape than (mission, bound, robot), or if values depend on padding.
         PosteriorError: If `check` is true and the diagnostics are bad.
 
     Example:

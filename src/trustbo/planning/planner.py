@@ -272,6 +272,13 @@ class Planner(Summary):
             x0: Expected trust at the start, shape () or (robot,), or labelled with the names of the
                 robots. The default is `params.x0_mean`.
 
+        Returns:
+            Best path, with its expected trust after each bound (bound, robot) and the value of the
+            objective, both at the mean parameters. `bands`, shape (quantile, bound, robot), are the
+            0.05, 0.25, 0.75 and 0.95 quantiles of expected trust over the draws, and `value_band`
+            are the 0.05 and 0.95 quantiles of the value. `exact` is False if the search was cut off
+            before it proved that no path is better; no path has a value above `limit`.
+
         Raises:
             TrustboError: If the robots or features of the parameters differ from those of the
                 workspace, or if beta0 is outside the range in which the search is exact.

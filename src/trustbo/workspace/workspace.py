@@ -123,8 +123,10 @@ class Workspace(Summary):
         a robot and the lead can see each other, given the assumed model of sight.
 
         Args:
-            terrain: Dataset from `read_terrain` or `synthetic_terrain`.
-            shape: Number of rows and columns of the planning grid.
+            terrain: Dataset from `read_terrain` or `synthetic_terrain`, with the heights `dem` and
+                `dsm`, shape (y, x), in metres, NaN where missing. The coordinates `x` and `y` are
+                those of a projected CRS, in metres.
+            shape: Number of rows and columns of the planning grid, which covers the terrain.
             team: Lead and overwatching robots; by default a lead and three robots.
             features: Mapping of each awareness feature to pixel features (see `terrain.FEATURES`).
                 A list of pixel features forms a composite index; a single name is used unchanged
@@ -137,6 +139,12 @@ class Workspace(Summary):
                 with the cells. The sets are, in this order: "standard"; "far", up to 60 m from the
                 lead's stop and 20 m apart; and "route", mostly for the sight of the lead's route.
                 Line of sight, traversability and the difficulty of driving differ between sets.
+
+        Returns:
+            Workspace whose `awareness` has the dims (robot, move, row, col, feature), with values
+            in [0, 1]. There are eight moves, or eight for each set of posts. Row 0 is in the north.
+            A value applies to the bound that enters (row, col) by the move, and is NaN if there is
+            no such bound. The features are those of `features` and, with `bounds`, `line_of_sight`.
 
         Raises:
             TrustboError: The dataset is not a terrain, the grid is too fine for the raster, all

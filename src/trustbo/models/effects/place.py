@@ -38,6 +38,11 @@ class PlaceEffect(Effect):
 
         u_i(a -> c) = beta . z_i(a -> c) + b + s(c) + e(a -> c) + r_i(a -> c)
 
+    The effects s, e and r are added to the drift, which has the unit of trust: that of a contact
+    rate, or of a logit for the family `"beta_binomial"`. Unless the model has
+    `memory="deviation"`, an effect therefore raises stationary trust by its value divided by
+    1 - beta0.
+
     Here s is a Gaussian process over cells with standard deviation tau_s and a Matern 3/2
     covariance. The effects e(a -> c) ~ N(0, g(f_e)^2 tau_e^2) of directed bounds are independent.
     The effects r_i of robots in a bound sum to 0 over the robots: for n robots, they have the
@@ -57,7 +62,7 @@ class PlaceEffect(Effect):
     The draws are shifted so that their mean remains 0. Fits and planned paths do not change.
 
     A bound has an effect e, and effects r, for each set of posts from which T2 watches it. The
-    effects e of different sets have the correlation `BETWEEN_POSTS`; effects r are independent.
+    effects e of different sets have the correlation 0.5; effects r are independent.
 
     The errors of awareness differ between robots, and they are the same each time that the robots
     drive a bound. Without r_i, these errors would look like independent noise, and bounds that the

@@ -27,7 +27,20 @@ from trustbo.statespace.matrices import namespace
 class RobotEffect(Effect):
     """Effect of a robot in a mission, proportional to the predicted line of sight.
 
-    Without a feature that predicts line of sight, the effect is constant during a mission.
+    The drift of robot i in a bound of mission m, with the predicted line of sight l_im, is ::
+
+        u_im = ... + (1 - beta0) l_im d_im
+
+    The effects d_im are in units of stationary trust, that is, of a contact rate, or of a logit for
+    the family `"beta_binomial"`: where l_im is 1, stationary trust is higher by d_im. The factor
+    1 - beta0 is 1 if the model has `memory="deviation"`, and 1 - B0_ii for `CoupledTrust`, where
+    d_im also acts on other robots through B0. Effects of different robots are independent. Over
+    missions, they have the covariance ::
+
+        cov(d_im, d_im') = tau_lasting^2 + tau_slow^2 rho^|m - m'| + tau_mission^2 [m = m']
+
+    Without a feature that predicts line of sight, l_im is 1, so the effect is constant during a
+    mission.
 
     Attributes:
         tau_slow: Scale of the half-normal prior on the standard deviation of the slow part.
