@@ -3,12 +3,13 @@
     python benchmarks/compare.py ["fit, NUTS"] [own] ... [-n 6 20] [--seeds 1]
 
 The missions are driven by the kinematic simulator on the example hillside, and all their rates have
-`n_ticks`. The model is `PooledTrust()`. For the function and for NumPyro's MCMC, the same model is
-written as a NumPyro function. The true difference is 0 nats, except for the noise of half a tick
-that `fit` adds to `delta_v`; the target is a difference of less than 3 nats. Each row shows the
-`elpd` of a posterior and its difference from the `elpd` of `tb.fit` with importance sampling. It
-also shows the standard error of the difference over missions, its standard deviation over seeds,
-the largest k-hat, and the number of missions that were left out by refits.
+`n_ticks`. The model is `PooledTrust` with equal noise in all bounds. For the function and for
+NumPyro's MCMC, the same model is written as a NumPyro function. The true difference is 0 nats,
+except for the noise of half a tick that `fit` adds to `delta_v`; the target is a difference of less
+than 3 nats. Each row shows the `elpd` of a posterior and its difference from the `elpd` of `tb.fit`
+with importance sampling. It also shows the standard error of the difference over missions, its
+standard deviation over seeds, the largest k-hat, and the number of missions that were left out by
+refits.
 
 `own, az.compare` passes NumPyro's own MCMC to `arviz.compare`, which does not refit.
 `own, densities` does the same without `n_ticks`, as version 0.4 did; `tb.compare` refuses this
@@ -16,6 +17,7 @@ comparison.
 """
 
 import warnings
+from dataclasses import replace
 
 import arviz as az
 import jax
@@ -80,11 +82,10 @@ def rates_of(data):
 def one_table(data, n_seeds, names):
     """Print the rows of all ways to fit the model to these missions."""
     model = program(data[0].features)
+    pooled = unscaled(data[0].features)
     ways = {
-        REFERENCE: lambda seed: tb.fit(data, tb.models.PooledTrust(), seed=seed),
-        "fit, NUTS": lambda seed: tb.fit(
-            data, tb.models.PooledTrust(), sampler="nuts", seed=seed, progress=False
-        ),
+        REFERENCE: lambda seed: tb.fit(data, pooled, seed=seed),
+        "fit, NUTS": lambda seed: tb.fit(data, pooled, sampler="nuts", seed=seed, progress=False),
         "fit, function": lambda seed: tb.fit(data, model, seed=seed, progress=False),
         "own": lambda seed: own_mcmc(data, model, seed),
         "own, az.compare": lambda seed: own_mcmc(data, model, seed),
@@ -132,9 +133,14 @@ def one_row(table, name, fit, reference):
     )  # fmt: skip
 
 
+def unscaled(features):
+    """Return `PooledTrust` for these features, with the same noise in all bounds."""
+    return tb.models.PooledTrust(replace(tb.models.Priors.from_features(features), f_v=None))
+
+
 def program(features):
-    """Write the model of `PooledTrust()` for these features as a NumPyro function."""
-    priors = tb.models.PooledTrust().for_features(features).priors
+    """Write the model of `unscaled` as a NumPyro function."""
+    priors = unscaled(features).for_features(features).priors
     of_features = (len(features),)
     mean = np.broadcast_to(priors.beta.loc, of_features).tolist()
     scale = np.broadcast_to(priors.beta.scale, of_features).tolist()

@@ -60,7 +60,7 @@ class Tuning(NamedTuple):
     """Whether the warm-up also tunes the mass matrix."""
 
 
-_OF_SCORES = Tuning(warmup=150, accept=0.65, depth=2, first_step=0.8, of_mass=False)
+_OF_SCORES = Tuning(warmup=150, accept=0.85, depth=3, first_step=0.8, of_mass=False)
 """Settings for scores; three steps of 0.8 standard deviations cross the posterior."""
 _OF_PROGRAM = Tuning(warmup=300, accept=0.9, depth=10)
 """Settings for the full program of a model."""
