@@ -7,7 +7,7 @@ import numpy as np
 
 from trustbo import stacking
 from trustbo.data import Mission
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_choice
 from trustbo.models.observations import Observations
 from trustbo.workspace.moves import MOVES, bounds_along
 
@@ -42,6 +42,16 @@ The shapes are awareness (mission, bound, robot, feature); contact_rate, n_ticks
 (mission, bound, robot); cell (mission, bound, 2), with rows and columns; and bound (mission, bound,
 3), with moves, rows and columns. `features` are the names of the features.
 """
+
+
+class FeatureNames(tuple[str, ...]):
+    """Names of features, among which a function looks up an index."""
+
+    __slots__ = ()
+
+    def index(self, value: Any, *limits: Any) -> int:
+        """Return the position of a name; raises TrustboError with all names if it is unknown."""
+        return super().index(require_choice("feature", value, self), *limits)
 
 
 def arrays_of(data: Data) -> dict[str, Any]:

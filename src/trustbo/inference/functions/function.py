@@ -21,7 +21,7 @@ from numpyro.primitives import Messenger, sample
 
 from trustbo.display import joined
 from trustbo.errors import TrustboError
-from trustbo.inference.functions.data import NAMES, RATES, Data, arrays_of
+from trustbo.inference.functions.data import NAMES, RATES, Data, FeatureNames, arrays_of
 from trustbo.inference.functions.explain import explained
 from trustbo.inference.functions.identity import constants_of, fingerprint, name_of
 from trustbo.inference.functions.plates import WholePlates
@@ -151,7 +151,8 @@ class FunctionModel:
 
     def call(self, data: Data) -> None:
         """Run the function on the inputs that it takes."""
-        self.function(**{name: data[name] for name in self.inputs})
+        named = {**data, "features": FeatureNames(data["features"])}
+        self.function(**{name: named[name] for name in self.inputs})
 
     def sites(self, data: Data) -> dict[str, Site]:
         """Return the latent variables of the function by name, without computing anything.
