@@ -511,6 +511,43 @@ def out_of_range(awareness, rates):
     numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
 
 
+def of_lost_feature(awareness, features, contact_rate=None):
+    a = numpyro.sample("a", dist.Normal())
+    drift = a * awareness[..., features.index("vegetation")]
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=contact_rate)
+
+
+def by_label(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    drift = a * awareness["line_of_sight"]
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
+
+
+def by_xarray(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    drift = a * awareness.sel(feature="line_of_sight")
+    numpyro.sample("contact_rate", ContactRate(drift, 0.5, 0.1, 0.1), obs=rates)
+
+
+def without_sum(awareness, rates):
+    a = numpyro.sample("a", dist.Normal())
+    numpyro.sample("contact_rate", ContactRate(a * awareness, 0.5, 0.1, 0.1), obs=rates)
+
+
+def of_the_team_with_ticks(awareness, contact_rate=None, n_ticks=None):
+    a = numpyro.sample("a", dist.Normal())
+    drift = a * awareness[..., 0].mean(-1, keepdims=True)
+    rates = ContactRate(drift, 0.5, 0.1, 0.1, n_ticks=n_ticks)
+    numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+def of_the_team_with_own_noise(awareness, contact_rate=None):
+    a = numpyro.sample("a", dist.Normal())
+    drift = a * awareness[..., 0].mean(-1, keepdims=True)
+    rates = ContactRate(drift, 0.5, np.full(awareness.shape[2], 0.1), 0.1)
+    numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
 def without_axes(awareness, rates):
     a = numpyro.sample("a", dist.Normal())
     with numpyro.plate("mission", len(awareness)):
@@ -608,6 +645,12 @@ def broken(awareness, rates):
         ),
         (refused(without_robots), r"the function model: drift must .*the axis of the robots"),
         (shaped, r"must have the shape .* = \(4, 8, 3\).*got \(4, 8, 2\)"),
+        (of_lost_feature, r"of_lost_feature.*'vegetation'.*traversability, line_of_sight"),
+        (refused(by_label), r"awareness\[..., features.index\(name\)\]"),
+        (refused(by_xarray), r"awareness\[..., features.index\(name\)\]"),
+        (refused(without_sum), "drift must .* awareness @ weights"),
+        (of_the_team_with_ticks, r"the drift of .* = \(4, 8, 3\).*got \(4, 8, 1\)"),
+        (of_the_team_with_own_noise, r"the drift of .* = \(4, 8, 3\).*got \(4, 8, 1\)"),
         (lambda z, rates=None: None, "must have the parameters awareness and contact_rate"),
         (lambda awareness, contact_rate, colour: None, "the parameter 'colour'"),
         (PooledTrust, "model: got type PooledTrust|give a model"),

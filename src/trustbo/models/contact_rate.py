@@ -20,7 +20,19 @@ from trustbo.statespace.form import coupled_robots, independent_robots
 from trustbo.statespace.matrices import apply, root
 
 
-class ParameterShapeError(TrustboError):
+class DriftMismatchError(TrustboError):
+    """Error for an argument of `ContactRate` whose shape does not fit that of the drift.
+
+    Attributes:
+        drift: Shape of the drift, which may be the one that is wrong.
+    """
+
+    def __init__(self, message: str, drift: tuple[int, ...] = ()) -> None:
+        super().__init__(message)
+        self.drift = drift
+
+
+class ParameterShapeError(DriftMismatchError):
     """Error for a parameter of `ContactRate` that has neither one value nor one of each robot."""
 
 
@@ -128,24 +140,26 @@ class ContactRate(dist.Distribution):
                     " For one mission, give drift[None]. If the axis of the robots is missing, add "
                     "it: drift[..., None] + jnp.zeros(n_robots)."
                 )
+            if u.ndim == 4:
+                remedy = " Sum over the features, for example awareness @ weights."
             raise TrustboError(
                 f"drift must have the shape (mission, bound, robot); got {u.shape}.{remedy}"
             )
 
-        n_robots = u.shape[2]
         of_bounds = {"offset": offset, "n_ticks": n_ticks, "noise_scale": noise_scale}
         for name, value in of_bounds.items():
             if value is not None and np.shape(value) not in ((), u.shape):
-                raise TrustboError(
+                raise DriftMismatchError(
                     f"{name} must have the shape (mission, bound, robot) = {u.shape} of the drift; "
-                    f"got {np.shape(value)}."
+                    f"got {np.shape(value)}.",
+                    u.shape,
                 )
 
         if delta_s is not None and np.size(delta_s) != 1:
             raise TrustboError(f"delta_s must be one number; got the shape {np.shape(delta_s)}.")
 
         matrices = {"beta0": beta0, "delta_w": delta_w, "delta_v": delta_v}
-        values = {name: _checked(name, v, n_robots, True) for name, v in matrices.items()}
+        values = {name: _checked(name, v, u.shape, True) for name, v in matrices.items()}
         is_scaled = not (isinstance(noise_scale, int | float) and noise_scale == 1)
         if is_scaled and values["delta_v"].ndim == 2:
             raise TrustboError(
@@ -153,17 +167,17 @@ class ContactRate(dist.Distribution):
                 "this noise; leave one out."
             )
         x0 = {"x0_mean": x0_mean, "x0_sd": x0_sd}
-        x0 = {name: _checked(name, v, n_robots, False)[None] for name, v in x0.items()}
+        x0 = {name: _checked(name, v, u.shape, False)[None] for name, v in x0.items()}
 
         if any(value.ndim == 2 for value in values.values()):
-            space = _coupled(values, x0, delta_s, n_robots)
+            space = _coupled(values, x0, delta_s, u.shape[2])
         else:
             shared = None if delta_s is None else jnp.reshape(jnp.asarray(delta_s, float), (1,))
             space = independent_robots(
                 *(value.reshape(1, -1) for value in values.values()),
                 **x0,
                 delta_s=shared,
-                n_members=1 if shared is None else n_robots,
+                n_members=1 if shared is None else u.shape[2],
             )
         self._set(space, Inputs(u, offset, noise_scale), n_ticks)
         self.adds_resolution = n_ticks is not None
@@ -329,8 +343,12 @@ def _read_effects(
     return tuple(one.effect for one in given), theta
 
 
-def _checked(name: str, value: ArrayLike, n_robots: int, may_be_matrix: bool) -> Array:
-    """Return a parameter as an array of floats; raise TrustboError if its shape is wrong."""
+def _checked(name: str, value: ArrayLike, shape: tuple[int, ...], may_be_matrix: bool) -> Array:
+    """Return a parameter as an array of floats; raise TrustboError if its shape is wrong.
+
+    `shape` is that of the drift.
+    """
+    n_robots = shape[2]
     array = jnp.asarray(value, float)
     allowed: list[tuple[int, ...]] = [(), (1,), (n_robots,)]
     if may_be_matrix:
@@ -341,7 +359,8 @@ def _checked(name: str, value: ArrayLike, n_robots: int, may_be_matrix: bool) ->
             shapes = f"(), ({n_robots},) or ({n_robots}, {n_robots})"
         raise ParameterShapeError(
             f"{name} must have the shape {shapes}, as the drift has {n_robots} robots; got "
-            f"{array.shape}."
+            f"{array.shape}.",
+            shape,
         )
     return array
 

@@ -15,6 +15,7 @@ from numpyro.distributions import (
 from trustbo.display import joined
 from trustbo.errors import TrustboError
 from trustbo.inference.functions.data import RATES, Data
+from trustbo.inference.functions.explain import wrong_drift
 from trustbo.inference.functions.sites import has_prior, safe
 from trustbo.models.contact_rate import ContactRate
 
@@ -43,17 +44,9 @@ def require_rates(who: str, trace: Mapping[str, Any], data: Data) -> None:
             f"the site 'contact_rate' of {who} is not observed; pass obs=contact_rate."
         )
 
-    shape = np.shape(data[RATES])
     given = (*rates.batch_shape, *rates.event_shape)
-    if given != shape:
-        remedy = ""
-        if given[2] == 1:
-            remedy = " Add the axis of the robots: drift + jnp.zeros(awareness.shape[:3])."
-        raise TrustboError(
-            f"the drift of {who} must have the shape (mission, bound, robot) = "
-            f"{shape}, as awareness is (mission, bound, robot, feature) = "
-            f"{np.shape(data['awareness'])}; got {given}.{remedy}"
-        )
+    if given != np.shape(data[RATES]):
+        raise TrustboError(wrong_drift(who, given, data))
 
     _require_variables(who, trace)
 
