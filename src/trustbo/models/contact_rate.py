@@ -133,19 +133,7 @@ class ContactRate(dist.Distribution):
                 matrix as delta_v.
         """
         u = jnp.asarray(drift, float)
-        if u.ndim != 3:
-            remedy = ""
-            if u.ndim == 2:
-                remedy = (
-                    " For one mission, give drift[None]. If the axis of the robots is missing, add "
-                    "it: drift[..., None] + jnp.zeros(n_robots)."
-                )
-            if u.ndim == 4:
-                remedy = " Sum over the features, for example awareness @ weights."
-            raise TrustboError(
-                f"drift must have the shape (mission, bound, robot); got {u.shape}.{remedy}"
-            )
-
+        _require_axes(u)
         of_bounds = {"offset": offset, "n_ticks": n_ticks, "noise_scale": noise_scale}
         for name, value in of_bounds.items():
             if value is not None and np.shape(value) not in ((), u.shape):
@@ -341,6 +329,20 @@ def _read_effects(
     theta = {name: value for one in given for name, value in one.values.items()}
     theta["inverse_gain"] = inverse_gain[0] if inverse_gain.shape == (1,) else inverse_gain
     return tuple(one.effect for one in given), theta
+
+
+def _require_axes(drift: Array) -> None:
+    """Raise TrustboError unless a drift has the axes of missions, bounds and robots."""
+    remedy = {
+        2: " For one mission, give drift[None]. If the axis of the robots is missing, add it: "
+        "drift[..., None] + jnp.zeros(n_robots).",
+        4: " Sum over the features, for example awareness @ weights.",
+    }
+    if drift.ndim != 3:
+        raise TrustboError(
+            f"drift must have the shape (mission, bound, robot); got {drift.shape}."
+            f"{remedy.get(drift.ndim, '')}"
+        )
 
 
 def _checked(name: str, value: ArrayLike, shape: tuple[int, ...], may_be_matrix: bool) -> Array:
