@@ -1,12 +1,17 @@
 """Check of a fitted model: planted faults stand out, and nothing does without one."""
 
+import re
+from pathlib import Path
+
 import numpy as np
+import numpyro
 import numpyro.distributions as dist
 import pytest
 
 import trustbo as tb
 from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, RobotEffect
 
+HOW_TO = Path(__file__).parents[2] / "docs/howto/your-own-model.md"
 MODEL = PooledTrust(effects=(PlaceEffect(), RobotEffect()))
 
 
@@ -194,3 +199,111 @@ def test_posteriors_of_a_campaign_read_from_files_are_checked(tmp_path):
     one = tb.inference.score(result.posteriors)
     other = tb.inference.score(list(result.posteriors), result.missions)
     assert one.equals(other)
+
+
+def rates_of(drift, contact_rate, effects=(), beta0=None):
+    beta0 = numpyro.sample("beta0", dist.Beta(2.0, 2.0)) if beta0 is None else beta0
+    delta_w = numpyro.sample("delta_w", dist.HalfNormal(0.1))
+    delta_v = numpyro.sample("delta_v", dist.HalfNormal(0.1))
+    with numpyro.plate("mission", len(drift)):
+        rates = tb.models.ContactRate(drift, beta0, delta_w, delta_v, effects=effects)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+def of_places(awareness, contact_rate=None):
+    weight = numpyro.sample("weight", dist.Normal(0.3, 0.3))
+    rates_of(weight * awareness[..., 0], contact_rate, [PlaceEffect().sample()])
+
+
+def of_places_with_known_memory(awareness, contact_rate=None):
+    weight = numpyro.sample("weight", dist.Normal(0.3, 0.3))
+    rates_of(weight * awareness[..., 0], contact_rate, [PlaceEffect().sample()], beta0=0.4)
+
+
+def with_one_beta(awareness, contact_rate=None):
+    beta = numpyro.sample("beta", dist.Normal(0.3, 0.3))
+    rates_of(beta * awareness[..., 0], contact_rate)
+
+
+def with_a_vector_beta(awareness, contact_rate=None):
+    beta = numpyro.sample("beta", dist.Normal(0.3, 0.3).expand([2]).to_event(1))
+    rates_of(beta.sum() * awareness[..., 0], contact_rate)
+
+
+def with_beta_of_robots(awareness, contact_rate=None):
+    with numpyro.plate("robot", awareness.shape[2]):
+        beta = numpyro.sample("beta", dist.Normal(0.3, 0.3))
+    rates_of(beta * awareness[..., 0], contact_rate)
+
+
+def with_signed_weights(awareness, contact_rate=None):
+    """Weights whose axis of features comes first."""
+    shape = awareness.shape[3], awareness.shape[2]
+    prior = dist.Normal(0.5, 0.3).expand(shape).to_event(2)
+    beta = numpyro.sample("beta", prior, infer={"event_dims": ["feature", "robot"]})
+    rates_of((awareness * beta.T).sum(-1), contact_rate, beta0=0.2)
+
+
+def test_a_place_with_less_contact_stands_out_in_a_function_with_its_memory():
+    found = checked(drawn(place=-0.35), of_places).table.loc["places"]
+    same = checked(drawn(place=-0.35)).table.loc["places"]
+
+    assert (found["label"], found["stands_out"]) == ("(0, 5)", True)
+    assert abs(found["size"] - same["size"]) < 0.05
+
+
+def test_places_are_not_tested_in_a_function_with_unknown_memory():
+    found = checked(drawn(place=-0.35), of_places_with_known_memory)
+
+    assert "beta0" in found.table.loc["places", "finding"]
+    assert "places" in found.verdict
+
+
+@pytest.mark.parametrize(
+    "model", [with_one_beta, with_a_vector_beta, with_beta_of_robots, of_places]
+)
+def test_weights_are_not_tested_without_weights_of_features(model):
+    found = checked(drawn(), model).table.loc["weights"]
+
+    assert "no variable 'beta' with the dim 'feature'" in found["finding"]
+    assert not found["stands_out"]
+
+
+def test_a_weight_of_the_wrong_sign_stands_out_in_a_function():
+    found = checked(drawn(slope=-0.8), with_signed_weights).table.loc["weights"]
+
+    assert (found["label"], found["stands_out"]) == ("line_of_sight", True)
+
+
+def test_the_verdict_says_what_was_not_tested():
+    posterior = tb.fit(drawn(n_missions=2), with_one_beta, progress=False)
+    assert tb.check(posterior).verdict == "robots, places, weights and coverage were not tested."
+
+    found = tb.check([posterior, posterior], drawn(n_missions=2))
+    assert (
+        re.search("coverage.*; robots, places and weights were not tested", found.verdict)
+        or (found.table.loc["coverage", "stands_out"])
+    )
+
+    found = tb.check(tb.fit(drawn(robot=-0.5), MODEL, progress=False))
+    assert found.verdict.startswith("r2")
+    assert found.verdict.endswith("; coverage was not tested.")
+
+
+@pytest.mark.slow
+def test_all_models_of_the_how_to_are_checked():
+    namespace = {"__name__": "__main__"}
+    for block in re.findall(r"^```python\n(.*?)^```", HOW_TO.read_text(), flags=re.S | re.M):
+        if "tb.load_result" not in block:
+            exec(block, namespace)
+
+    workspace = namespace["workspace"]
+    for name in ("saturating", "by_robot", "field", "by_cell", "by_mission", "with_effects"):
+        campaign = tb.iterate(
+            workspace, (4, 0), (0, 4), model=namespace[name], simulator=namespace["simulator"],
+            n_iterations=3, fit={"draws": 300, "check": False}, progress=False,
+        )  # fmt: skip
+        found = tb.check(campaign)
+        is_tested = ~found.table["finding"].str.startswith("not tested")
+        assert is_tested["coverage"]
+        assert is_tested["robots"] == is_tested["places"] == (name == "with_effects")

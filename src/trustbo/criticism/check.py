@@ -1,6 +1,6 @@
 """Check a fitted model for problems in its posterior and its predictions."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -12,9 +12,11 @@ from trustbo.data import Mission
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError
 from trustbo.inference.params import (
+    is_by_position,
     is_of_people,
     joined_draws,
     missions_of,
+    names_in,
     parameters_of,
     theta_of,
 )
@@ -39,6 +41,8 @@ _TOLERANCE = 0.05
 _ERRORS = 2.0
 """Number of standard errors above which a difference is significant."""
 _OF_DRAWS = ("chain", "draw")
+_NOT_TESTED = "not tested: "
+"""Start of a finding that states why a check was not possible."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,7 +50,7 @@ class Check(Summary):
     """Result of the check of a fitted model.
 
     Attributes:
-        verdict: The findings that stand out, as text.
+        verdict: The findings that stand out, and the checks that were not tested, as text.
         table: One row per check (index `check`). The columns are the text of the `finding`, whether
             it `stands_out`, the most affected `label`, and the `size` and `probability` of the
             effect.
@@ -85,6 +89,11 @@ class Finding(NamedTuple):
     size: float = np.nan
     probability: float = np.nan
 
+    @property
+    def is_tested(self) -> bool:
+        """Whether the model and the data allowed the check."""
+        return not self.finding.startswith(_NOT_TESTED)
+
 
 @computing()
 def check(
@@ -102,7 +111,10 @@ def check(
     is subtracted because a shift that most places share cannot be distinguished from the intercept.
     A weight stands out if its sign contradicts its prior. The coverage of 90 % intervals one
     mission ahead stands out if it differs from .9 by more than .05 and two standard errors over
-    missions.
+    missions. The verdict also names the checks that the model or the data do not allow: robots and
+    places need the effects of the model, weights a variable `beta` or `B` with the dim `feature`,
+    and coverage all posteriors of a campaign. Effects of places in a NumPyro function also need a
+    variable `beta0`.
 
     See also `pit` of `tb.inference.score` for the shape of predictions, `tb.compare` for other
     models, and `az.psense_summary(posterior)` for the sensitivity to the priors.
@@ -143,8 +155,21 @@ def check(
     }
 
     table = pd.DataFrame(list(findings.values()), pd.Index(findings, name="check"))
-    odd = [finding.finding for finding in findings.values() if finding.stands_out]
-    return Check(("; ".join(odd) or "nothing stands out") + ".", table, robots)
+    return Check(_verdict(findings), table, robots)
+
+
+def _verdict(findings: Mapping[str, Finding]) -> str:
+    """Return what stands out, and what was not tested, as one sentence."""
+    tested = [name for name, finding in findings.items() if finding.is_tested]
+    others = [name for name in findings if name not in tested]
+    words = [finding.finding for finding in findings.values() if finding.stands_out]
+
+    if tested and not words:
+        words = [f"nothing stands out in {joined(tested)}"]
+    if others:
+        was = "was" if others == ["coverage"] else "were"
+        words.append(f"{joined(others)} {was} not tested")
+    return "; ".join(words) + "."
 
 
 def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
@@ -195,7 +220,7 @@ def _in_all_bounds(posterior: xr.DataTree) -> xr.DataArray | float:
 def _check_robots(robots: pd.DataFrame) -> Finding:
     """Check whether the effect of a robot in a mission differs from the median."""
     if robots.empty:
-        return Finding("not tested: the model has no robot effects")
+        return Finding(_NOT_TESTED + "the model has no robot effects")
     odd = robots.loc[robots["stands_out"]]
     if odd.empty:
         return Finding("no robot stands out", size=robots["effect"].abs().to_numpy().max())
@@ -227,16 +252,21 @@ def _check_robots(robots: pd.DataFrame) -> Finding:
 def _check_places(posterior: xr.DataTree) -> Finding:
     """Check whether the effect of a place on stationary trust is large."""
     if "places" not in posterior.children:
-        return Finding("not tested: the model has no place effects")
+        return Finding(_NOT_TESTED + "the model has no place effects")
     places = of_workspace(posterior["places"].to_dataset())
     if not places.sizes["bound"]:
-        return Finding("not tested: no place of the workspace was visited")
+        return Finding(_NOT_TESTED + "no place of the workspace was visited")
 
     cells = pd.MultiIndex.from_arrays([places["cell_row"].values, places["cell_col"].values])
     where = pd.MultiIndex.from_arrays([places["bound_row"].values, places["bound_col"].values])
     of_cells = joined_draws(places["place"])[:, cells.get_indexer(where)]
     total = joined_draws(places["place_bound"]) + of_cells
-    inverse_gain = theta_of(posterior, parameters_of(posterior))["inverse_gain"]
+    inverse_gain = _inverse_gain(posterior)
+    if inverse_gain is None:
+        return Finding(
+            f"{_NOT_TESTED}the function has no variable 'beta0' below 1, one number or one of each "
+            "robot, which relates its place effects to trust"
+        )
     per_drift = inverse_gain.reshape(len(total), -1).mean(1, keepdims=True)
     draws = total / per_drift  # effects on stationary trust
     draws = draws / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
@@ -256,12 +286,32 @@ def _check_places(posterior: xr.DataTree) -> Finding:
     return Finding(words, not odd.empty, most["place"], size, most["sure"])
 
 
+def _inverse_gain(posterior: xr.DataTree) -> np.ndarray | None:
+    """Return the drift that raises stationary trust by 1, shape (draw,) or (draw, robot).
+
+    For a function, it is that of its variable `beta0`; None if there is no such variable.
+    """
+    if not is_by_position(posterior):
+        return theta_of(posterior, parameters_of(posterior))["inverse_gain"]
+    variables = posterior["posterior"].to_dataset()
+    if "beta0" not in variables:
+        return None
+
+    beta0 = joined_draws(variables["beta0"])
+    is_memory = beta0.shape[1:] in ((), (1,), (len(names_in(posterior, "robot")),))
+    return 1.0 - beta0 if is_memory and (beta0 < 1.0).all() else None
+
+
 def _check_weights(posterior: xr.DataTree) -> Finding:
     """Check whether the sign of a weight contradicts the prior."""
-    name = "beta" if "beta" in posterior["posterior"] else "B"
+    variables = posterior["posterior"].to_dataset()
+    name = "B" if "B" in variables and not is_by_position(posterior) else "beta"
+    if name not in variables or "feature" not in variables[name].dims:
+        return Finding(f"{_NOT_TESTED}the model has no variable 'beta' with the dim 'feature'")
     if "prior" not in posterior.children or name not in posterior["prior"]:
-        return Finding("not tested: the posterior contains no prior draws")
-    features = posterior["posterior"].to_dataset()["feature"].values
+        return Finding(f"{_NOT_TESTED}the posterior contains no prior draws of {name!r}")
+
+    features = variables["feature"].values
     prior = _weights(posterior, "prior", name)
     draws = _weights(posterior, "posterior", name)
 
@@ -282,7 +332,8 @@ def _check_weights(posterior: xr.DataTree) -> Finding:
 
 def _weights(posterior: xr.DataTree, group: str, name: str) -> np.ndarray:
     """Return the draws (draw, feature) of the weights in a group, for all robots."""
-    weights = joined_draws(posterior[group].to_dataset()[name])
+    array = posterior[group].to_dataset()[name].transpose(..., "feature")
+    weights = joined_draws(array)
     if name == "B":  # keep the weights of each robot's own features, which have an expected sign
         weights = np.einsum("diim->dim", weights)
     return weights.reshape(-1, weights.shape[-1])
@@ -293,18 +344,18 @@ def _check_coverage(
 ) -> Finding:
     """Check whether 90 % intervals one mission ahead contain 90 % of the rates."""
     if len(trees) < 2:
-        return Finding("not tested: this check needs all posteriors of a campaign")
+        return Finding(_NOT_TESTED + "this check needs all posteriors of a campaign")
 
     if missions is None:
         missions = trees.missions if isinstance(trees, Posteriors) else missions_of(last)
     if not predictions("check", trees, missions)[0]:
-        return Finding("not tested: no mission has an earlier posterior that predicts it")
+        return Finding(_NOT_TESTED + "no mission has an earlier posterior that predicts it")
 
     pit = score(trees, missions)["pit"]
     is_inside = (abs(pit - 0.5) <= 0.5 * _COVERAGE).where(pit.notnull())
     within = is_inside.mean(("bound", "robot")).dropna("mission")
     if not within.size:
-        return Finding("not tested: no rate of the predicted missions was measured")
+        return Finding(_NOT_TESTED + "no rate of the predicted missions was measured")
 
     share = float(within.mean())
     error = float(within.std(ddof=1)) / np.sqrt(within.size) if within.size > 1 else np.inf
