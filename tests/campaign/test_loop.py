@@ -36,6 +36,13 @@ def result(workspace):
     return run(workspace)
 
 
+def test_an_unknown_argument_is_refused_with_the_closest_one(workspace):
+    with pytest.raises(TypeError, match=r"iterate.*'n_iteration'.*'n_iterations'"):
+        tb.iterate(workspace, *ENDS, n_iteration=3)
+    with pytest.raises(TypeError, match=r"iterate.*'xyz'$"):
+        tb.iterate(workspace, *ENDS, xyz=3)
+
+
 def test_history_has_a_row_for_each_mission(result):
     history, paths = result.history, [mission.path for mission in result.missions]
     assert history["iteration"].values.tolist() == [1, 2, 3]

@@ -1,5 +1,8 @@
 """Run whole campaigns in a simulator, and resume them."""
 
+import inspect
+from collections.abc import Mapping
+from difflib import get_close_matches
 from typing import Any
 
 from trustbo.campaign.campaign import Campaign
@@ -52,11 +55,13 @@ def iterate(
     Raises:
         TrustboError: The input is invalid or the folder has a campaign; raised before any work.
         NoPathError: The goal cannot be reached.
+        TypeError: There is no such argument.
 
     Example:
         >>> result = tb.iterate(workspace, start=(9, 0), goal=(0, 9), n_iterations=8)
         >>> result.path
     """
+    _require_arguments(options)
     campaign = Campaign(workspace, start, goal, progress=progress, **options)
     steps = campaign.run(simulator, n_iterations, stop=stop, progress=progress)
     with campaign:
@@ -65,6 +70,16 @@ def iterate(
         for _ in steps:
             pass
     return campaign
+
+
+def _require_arguments(options: Mapping[str, Any]) -> None:
+    """Raise TypeError for options of `iterate` that are no arguments of it or of `Campaign`."""
+    known = [*inspect.signature(iterate).parameters, *inspect.signature(Campaign).parameters]
+    for name in options:
+        if name not in known:
+            closest = get_close_matches(name, known, n=1)
+            remedy = f"; did you mean {closest[0]!r}?" if closest else ""
+            raise TypeError(f"iterate() got an unexpected keyword argument {name!r}{remedy}")
 
 
 def resume(
