@@ -241,7 +241,7 @@ def with_signed_weights(awareness, contact_rate=None):
     shape = awareness.shape[3], awareness.shape[2]
     prior = dist.Normal(0.5, 0.3).expand(shape).to_event(2)
     beta = numpyro.sample("beta", prior, infer={"event_dims": ["feature", "robot"]})
-    rates_of((awareness * beta.T).sum(-1), contact_rate, beta0=0.2)
+    rates_of(0.7 + (awareness * beta.T).sum(-1), contact_rate, beta0=0.2)
 
 
 def test_a_place_with_less_contact_stands_out_in_a_function_with_its_memory():
@@ -280,10 +280,7 @@ def test_the_verdict_says_what_was_not_tested():
     assert tb.check(posterior).verdict == "robots, places, weights and coverage were not tested."
 
     found = tb.check([posterior, posterior], drawn(n_missions=2))
-    assert (
-        re.search("coverage.*; robots, places and weights were not tested", found.verdict)
-        or (found.table.loc["coverage", "stands_out"])
-    )
+    assert found.verdict.endswith("; robots, places and weights were not tested.")
 
     found = tb.check(tb.fit(drawn(robot=-0.5), MODEL, progress=False))
     assert found.verdict.startswith("r2")
