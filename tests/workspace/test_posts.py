@@ -59,6 +59,18 @@ def test_posts_keep_the_distances_of_their_set(workspace, name):
     np.testing.assert_array_equal(posts.watching((1, 1, name), None), posts.watching((1, 1), None))
 
 
+@pytest.mark.parametrize("name", POST_SETS)
+def test_posts_do_not_coincide_where_all_positions_are_within_the_gap(name):
+    workspace = tb.Workspace.from_terrain(hillside(), (3, 3), bounds=False)
+    posts = workspace.posts
+    stop = posts.stop((1, 1))
+    around = stop + np.array([[4.0, 0.0], [0.0, 4.0], [4.0, 4.0]])
+    posts._lattice = lambda *_: around
+
+    places = posts.watching((1, 1, name), (0, 1))
+    assert len(np.unique(places, axis=0)) == len(around)
+
+
 def test_the_change_by_the_next_way_is_that_of_the_line_of_sight(workspace):
     """Against `bound_features`, which closes up to one set of posts, for random pairs of bounds."""
     posts = workspace.posts

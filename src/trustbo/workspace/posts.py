@@ -283,7 +283,8 @@ class Posts:
             score = scores[robot]
             if i:
                 nearest = np.stack([cdist(position, taken).min(1) for taken in posts[:, :i]])
-                score = score - _TOO_CLOSE * (nearest < gap)
+                is_taken = nearest == 0.0  # avoided even where all positions are too close
+                score = score - _TOO_CLOSE * (nearest < gap) - _TOO_CLOSE * is_taken
             posts[:, i] = position[np.argmax(score, axis=1)]
 
         for of_next, c in zip(posts, ahead, strict=True):
