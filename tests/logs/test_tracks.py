@@ -443,3 +443,14 @@ def test_short_visits_to_cells_that_the_lead_drives_through_are_bounds(field):
     fast = [table.assign(t=table.t / 6.0) for table in (poses, seen)]  # 3.3 s in each cell
     one = read_driven(field, *fast, tick=1.0 / 6.0)
     assert (len(one.bounds), one.status) == (3, "ok")
+
+
+def test_a_planned_path_with_sets_of_posts_is_that_of_the_mission(field):
+    poses, seen = driven(field, PLANNED)
+    path = ((3, 0, "far"), (2, 1), (1, 2, "route"), (0, 3))
+    one = read_driven(field, poses, seen, path=path)
+    assert (one.path, one.status) == (path, "ok")
+    plain = read_driven(field, poses, seen)
+    np.testing.assert_array_equal(one.contact_rate, plain.contact_rate)
+    with pytest.raises(TrustboError, match="path"):
+        read_driven(field, poses, seen, path=[(3, 0, "near"), *PLANNED[1:]])

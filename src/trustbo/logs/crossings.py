@@ -6,8 +6,8 @@ from itertools import groupby
 import numpy as np
 import pandas as pd
 
-from trustbo.data import Cell
-from trustbo.errors import TrustboError, require_cells, warn
+from trustbo.data import Cell, Station, cells_of, require_path
+from trustbo.errors import TrustboError, warn
 from trustbo.logs.poses import GAP, UNITS
 from trustbo.workspace.grid import Grid
 
@@ -20,8 +20,8 @@ def crossings_of(
     n: int,
     tick: float,
     grid: Grid,
-    planned: Sequence[Cell] | None,
-) -> tuple[Sequence[Cell], np.ndarray]:
+    planned: Sequence[Station] | None,
+) -> tuple[Sequence[Station], np.ndarray]:
     """Return the path of the lead (by default, all cells that it enters) and its bounds' edges.
 
     Entering and leaving follow one rule: a cell is left if the lead does not return within 5 s.
@@ -40,9 +40,10 @@ def crossings_of(
         )
 
     driven = [cell for cell, _ in groupby(cell for _, cell in entered)]
-    path = require_cells("path", driven if planned is None else planned)
+    stations = require_path("path", driven if planned is None else planned)
+    path = cells_of(stations)
     if planned is not None and len(path) < 2:
-        raise TrustboError(f"path must have at least two cells; got {list(path)}.")
+        raise TrustboError(f"path must have at least two cells; got {path}.")
 
     edges: list[int] = []
     for k, cell in entered:
@@ -59,7 +60,7 @@ def crossings_of(
             f"log and never enters the next cell of the path, {path[len(edges)]}; the mission is "
             "read as aborted there."
         )
-    return path, np.array([*edges[1:], end])
+    return stations, np.array([*edges[1:], end])
 
 
 def _without_excursions(

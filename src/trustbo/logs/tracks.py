@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from trustbo.data import Cell, Mission
+from trustbo.data import Mission, Station
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.logs.crossings import crossings_of
 from trustbo.logs.detections import (
@@ -31,7 +31,7 @@ def read_tracks(
     detections: Any,
     workspace: Workspace | None = None,
     *,
-    path: Sequence[Cell] | None = None,
+    path: Sequence[Station] | None = None,
     lead: str | None = None,
     window: float = 20.0,
     tick: float = 1.0,
@@ -172,7 +172,7 @@ def _mission(
     pairs: pd.DataFrame,
     edges: np.ndarray,
     tick: float,
-    path: Sequence[Cell] | None,
+    path: Sequence[Station] | None,
     robots: Sequence[str],
     workspace: Workspace | None,
 ) -> Mission:
