@@ -7,6 +7,7 @@ import pytest
 import trustbo as tb
 from trustbo.data import NOWHERE
 from trustbo.errors import TrustboError
+from trustbo.hazard.trials import Trials
 from trustbo.logs import read_tracks
 
 POSES = {"t": [0.0, 4.0, 8.0, 0.0, 4.0, 8.0], "robot": [*"aaabbb"], "x": [0.0, 4.0, 8.0] * 2,
@@ -454,3 +455,47 @@ def test_a_planned_path_with_sets_of_posts_is_that_of_the_mission(field):
     np.testing.assert_array_equal(one.contact_rate, plain.contact_rate)
     with pytest.raises(TrustboError, match="path"):
         read_driven(field, poses, seen, path=[(3, 0, "near"), *PLANNED[1:]])
+
+
+def test_a_lead_that_is_stuck_on_the_way_to_a_cell_fails_the_bound_into_it(field):
+    """The bounds are those of a table in which the failed bound has a status and no rates."""
+    tables = [table[table.t < 45.0] for table in driven(field, PLANNED)]  # before it enters (0, 3)
+    aborted = read_driven(field, *tables)
+    assert (len(aborted.bounds), aborted.status) == (2, "aborted")
+
+    one = read_driven(field, *tables, status="stuck")
+    assert (one.driven, one.statuses) == (tuple(PLANNED), ["ok", "ok", "stuck"])
+    np.testing.assert_array_equal(one.contact_rate[:2], aborted.contact_rate)
+    assert np.isnan(one.contact_rate[2]).all()
+
+    table = tb.logs.to_frame([aborted])
+    table.loc[table["bound"] == 2, "status"] = "ok"
+    table.loc[table["bound"] == 3, "status"] = "stuck"
+    (read,) = tb.logs.read_table(table)
+    assert one.has_same_data(read)
+
+
+def test_what_a_stuck_lead_does_after_it_left_its_cell_is_not_measured(field):
+    tables = driven(field, [(3, 0), (2, 1), (3, 2), (3, 3)])  # is towed away from (2, 1)
+    with pytest.warns(UserWarning, match=r"\(1, 2\)"):
+        one = read_driven(field, *tables, status="stuck")
+    assert one.statuses == ["ok", "stuck"]
+    assert np.isnan(one.contact_rate[1]).all()
+    assert np.isnan(one.n_ticks[1]).all()
+
+
+def test_a_failed_bound_of_tracks_is_charged_and_no_other(field):
+    tables = [table[table.t < 45.0] for table in driven(field, PLANNED)]
+    one = read_driven(field, *tables, status="stuck")
+    trials = Trials.from_missions([one])
+    np.testing.assert_array_equal(trials.bounds[:, 1:3], sorted(PLANNED[1:]))
+    np.testing.assert_array_equal(trials.failed, [1.0, 0.0, 0.0])  # into (0, 3)
+
+
+@pytest.mark.parametrize(
+    "options", [{"status": "stuck"}, {"status": "ok"}, {"status": "lost"},
+                {"status": "stuck", "path": None}],
+)  # fmt: skip
+def test_a_status_that_does_not_fit_the_log_is_refused(field, options):
+    with pytest.raises(TrustboError, match="status"):
+        read_driven(field, *driven(field, PLANNED), **options)

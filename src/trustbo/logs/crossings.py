@@ -58,7 +58,7 @@ def crossings_of(
         warn(
             f"the lead leaves cell {path[len(edges) - 1]} {end * tick:g} s after the start of the "
             f"log and never enters the next cell of the path, {path[len(edges)]}; the mission is "
-            "read as aborted there."
+            "read as ended there."
         )
     return stations, np.array([*edges[1:], end])
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from trustbo.data import Mission, Station
+from trustbo.data import STATUSES, Mission, Station
 from trustbo.errors import TrustboError, require_choice, require_positive
 from trustbo.logs.crossings import crossings_of
 from trustbo.logs.detections import (
@@ -22,6 +22,8 @@ from trustbo.workspace import Workspace
 _FEATURES = ("near", "ahead")
 _AHEAD = np.pi / 6.0
 """Largest angle between the heading of a robot and a lead ahead of it, rad."""
+_ABORTED = "aborted"
+"""Status of a mission that ended early although no bound failed."""
 _ROUNDING = 1e-3
 """Part of a tick by which rounded times may shorten a log; Unix times have steps of 2.4e-7 s."""
 
@@ -35,6 +37,7 @@ def read_tracks(
     lead: str | None = None,
     window: float = 20.0,
     tick: float = 1.0,
+    status: str = _ABORTED,
 ) -> list[Mission]:
     """Read a log of poses and detections as missions, one for each lead, which all robots watch.
 
@@ -49,8 +52,8 @@ def read_tracks(
     the workspace and without measured awareness. A bound begins where the lead enters the next cell
     of its path. Excursions of at most 5 s, from which the lead returns to its cell, are ignored. If
     the planned path is given, a cell whose corner the lead only cuts does not count as a bound. If
-    the lead does not reach the last cell, the status is `"aborted"`. The last bound ends where the
-    lead leaves its cell for more than 5 s.
+    the lead does not reach the last cell, the mission has the given status. The last bound ends
+    where the lead leaves its cell for more than 5 s.
 
     Without a workspace, bounds are time windows. The lead is also listed as a robot, with contact
     rates NaN and features 0. All missions therefore have the same robots. A bound without any tick
@@ -71,6 +74,9 @@ def read_tracks(
             without a workspace, every robot is used as the lead in turn.
         window: Length of a bound without a workspace, s.
         tick: Length of a tick, s.
+        status: Why the lead did not reach the last cell of `path`. If it is not `"aborted"`, the
+            bound into the first cell that the lead did not enter failed, and is added to the
+            mission without measurements.
 
     Returns:
         One mission for each lead that has a complete bound.
@@ -78,7 +84,8 @@ def read_tracks(
     Raises:
         TrustboError: Values, times, poses or units are invalid, the detections have a further
             column, no detection is between two robots with poses, the lead is unknown, it misses a
-            cell of the given path, or the log has no complete bound.
+            cell of the given path, a status is given although it reaches the last cell, or the log
+            has no complete bound.
 
     Warns:
         UserWarning: A watcher is unknown, detections lie outside the time of the poses, their
@@ -94,6 +101,8 @@ def read_tracks(
     window = require_positive("window", window)
     if path is not None and workspace is None:
         raise TrustboError("path= needs the workspace of its cells.")
+    if require_choice("status", status, STATUSES[1:]) != _ABORTED and path is None:
+        raise TrustboError(f"status={status!r} needs path=, with the cell that was not reached.")
 
     tracks, looks, unknown = read_tables(poses, detections)
     robots = tuple(tracks["robot"].unique())
@@ -122,7 +131,7 @@ def read_tracks(
 
         of_lead = pairs.loc[pairs["lead"] == name]
         if len(edges) > 1 and len(of_lead):
-            missions.append(_mission(of_lead, edges, tick, cells, team, workspace))
+            missions.append(_mission(of_lead, edges, tick, cells, team, workspace, status))
 
     if not missions:
         usual = tracks.sort_values("t").groupby("robot")["t"].diff().median()
@@ -175,13 +184,26 @@ def _mission(
     path: Sequence[Station] | None,
     robots: Sequence[str],
     workspace: Workspace | None,
+    status: str,
 ) -> Mission:
     """Make a mission of one lead; `edges` has the first tick of each bound, and then the end."""
+    duration = np.diff(edges) * tick
+    if path is None or len(edges) == len(path):
+        if status != _ABORTED:
+            raise TrustboError(
+                f"status={status!r}, but the lead enters the last cell of the path; leave status= "
+                "out, or end the poses where the bound failed."
+            )
+        status = "ok"
+    elif status != _ABORTED:
+        duration = np.append(duration, np.nan)  # of the bound that failed
+
+    pairs = pairs.loc[pairs["tick"] < edges[-1]]  # without the time after the last bound
     bound = np.searchsorted(edges, pairs["tick"], side="right")
     groups = pairs.assign(bound=bound).groupby(["bound", "robot"])
     means = {name: (name, "mean") for name in ("contact_rate", *_FEATURES)}
     data = groups.agg(n_ticks=("tick", "count"), **means).to_xarray()
-    data = data.reindex(bound=range(1, len(edges)), robot=list(robots))
+    data = data.reindex(bound=range(1, len(duration) + 1), robot=list(robots))
 
     if workspace is None:
         features = _FEATURES
@@ -191,8 +213,7 @@ def _mission(
         features = workspace.features
         z = np.full((*data["n_ticks"].shape, len(features)), np.nan)
 
-    status = "ok" if path is None or len(edges) == len(path) else "aborted"
     return Mission.from_arrays(
-        path, z, data["contact_rate"], np.diff(edges) * tick, status,
+        path, z, data["contact_rate"], duration, status,
         n_ticks=data["n_ticks"], features=features, robots=robots,
     )  # fmt: skip
