@@ -10,6 +10,7 @@ from trustbo.errors import TrustboError
 from trustbo.hazard.trials import Trials
 from trustbo.logs import read_tracks
 
+pytestmark = pytest.mark.filterwarnings("ignore:[0-9]+ detections by the lead")  # of `SEEN`
 POSES = {"t": [0.0, 4.0, 8.0, 0.0, 4.0, 8.0], "robot": [*"aaabbb"], "x": [0.0, 4.0, 8.0] * 2,
          "y": [0.0] * 3 + [3.0] * 3, "heading": [0.0] * 6}  # fmt: skip
 SEEN = {"t": [0.5, 0.7, 6.2], "watcher": [*"aab"], "seen": [*"bba"]}
@@ -398,7 +399,9 @@ def test_robots_that_only_the_lead_detects_are_warned_of(field):
     swapped = seen.rename(columns={"watcher": "seen", "seen": "watcher"})
     with pytest.warns(UserWarning, match="a, b never .* 120 detections"):
         assert read_driven(field, poses, swapped).contact_rate.max() == 0.0
-    read_driven(field, poses, pd.concat([seen, swapped]))
+    with pytest.warns(UserWarning, match="120 detections"):
+        both = read_driven(field, poses, pd.concat([seen, swapped]))
+    np.testing.assert_array_equal(both.contact_rate, read_driven(field, poses, seen).contact_rate)
 
 
 @pytest.mark.parametrize("heading", [None, np.nan, [0.0, *[np.nan] * 600] * 3])

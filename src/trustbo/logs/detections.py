@@ -162,23 +162,26 @@ def warn_of_names(
         )
     if silent := [name for name in dict.fromkeys([*team, *leads]) if name not in named]:
         warn(f"no detection names {', '.join(silent)}; their contact is 0.")
-    _warn_of_swapped(looks, leads, team)
+    _warn_of_the_lead(looks, leads, team)
 
 
-def _warn_of_swapped(looks: pd.DataFrame, leads: Sequence[str], team: Sequence[str]) -> None:
-    """Warn of robots that never detect the only lead, although it detects them."""
+def _warn_of_the_lead(looks: pd.DataFrame, leads: Sequence[str], team: Sequence[str]) -> None:
+    """Warn of detections by the only lead, and of robots that never detect it in return."""
     if len(leads) > 1:
         return
 
     watchers = looks.loc[looks["lead"].isin(leads), "robot"].unique()
     by_lead = looks.loc[looks["robot"].isin(leads) & looks["lead"].isin(team), "lead"]
-    ignored = by_lead[~by_lead.isin(watchers)]
-    if len(ignored):
-        warn(
-            f"{_listed(ignored)} never detects the lead {_listed(leads)}, so the contact is 0; "
-            f"{len(ignored)} detections by the lead are ignored. Exchange watcher and seen if they "
-            "are swapped, or for detections by the lead while T2 closes up."
-        )
+    if by_lead.empty:
+        return
+
+    never = by_lead[~by_lead.isin(watchers)]
+    of_never = f"{_listed(never)} never detects the lead, so the contact is 0; "
+    warn(
+        f"{of_never if len(never) else ''}{len(by_lead)} detections by the lead {_listed(leads)} "
+        "are ignored. Exchange watcher and seen if they are swapped, or for detections by the lead "
+        "while T2 closes up; leave out its other detections."
+    )
 
 
 def warn_of_times(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) -> None:

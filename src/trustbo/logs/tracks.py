@@ -88,9 +88,9 @@ def read_tracks(
             has no complete bound.
 
     Warns:
-        UserWarning: A watcher is unknown, detections lie outside the time of the poses, their
-            interval is not the tick, poses are more than 5 s apart, a robot is never seen or never
-            watches, or the lead leaves the planned path.
+        UserWarning: A watcher is unknown, detections lie outside the time of the poses, the lead
+            detects robots, the interval of detections is not the tick, poses are more than 5 s
+            apart, a robot is never seen or never watches, or the lead leaves the planned path.
 
     Example:
         >>> missions = tb.logs.read_tracks("poses.csv", "detections.csv", window=20.0)
