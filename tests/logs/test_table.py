@@ -131,6 +131,12 @@ def test_what_is_amiss_is_refused_in_one_line(columns):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("n_ticks", [None, [None, 7, 9]])
+def test_rates_in_percent_are_refused_as_such(n_ticks):
+    with pytest.raises(TrustboError, match=r"contact_rate = 48.3 is outside \[0, 1\]"):
+        read_table(rows(contact_rate=[None, 48.3, 51.2], n_ticks=n_ticks))
+
+
 @pytest.mark.parametrize(
     "values", [[0.9, 0.8, 0.7], [None, 90.0, 80.0], [None, "full", "low"], [None, -0.1, 0.2]]
 )

@@ -153,6 +153,7 @@ def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:
         numbers = columns.numbers(name, required=False, hint=f"; {_FURTHER}")
         values[name] = without_rounding(numbers) if is_mapped else numbers
 
+    _refuse_shares_outside(columns, "contact_rate", values["contact_rate"], "divide percent by 100")
     if is_mapped:
         _refuse_misplaced_values(columns, features, values)
     if columns.find("n_ticks"):
@@ -160,13 +161,20 @@ def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:
     return pd.DataFrame(values, index=columns.frame.index)
 
 
+def _refuse_shares_outside(columns: Columns, name: str, values: np.ndarray, remedy: str) -> None:
+    """Raise TrustboError for values outside [0, 1] that are not due to rounding."""
+    shares = without_rounding(values)
+    columns.refuse(name, (shares < 0.0) | (shares > 1.0), f"is outside [0, 1]; {remedy}")
+
+
 def _refuse_misplaced_values(
     columns: Columns, features: Sequence[str], values: dict[str, Any]
 ) -> None:
     """Raise TrustboError for features outside [0, 1], and for values at the start cell."""
     for name in features:
-        outside = (values[name] < 0.0) | (values[name] > 1.0)
-        columns.refuse(name, outside, f"is outside [0, 1]; {_FURTHER}, and divide percent by 100")
+        _refuse_shares_outside(
+            columns, name, values[name], f"{_FURTHER}, and divide percent by 100"
+        )
 
     for name in (*RATES, *features):
         at_start = (values["bound"] == 0) & ~np.isnan(values[name])
