@@ -502,3 +502,17 @@ def test_a_failed_bound_of_tracks_is_charged_and_no_other(field):
 def test_a_status_that_does_not_fit_the_log_is_refused(field, options):
     with pytest.raises(TrustboError, match="status"):
         read_driven(field, *driven(field, PLANNED), **options)
+
+
+def test_a_robot_of_the_team_without_poses_is_refused_with_the_names_of_the_log(field):
+    poses, seen = driven(field, PLANNED)
+    renamed = poses.assign(robot=poses.robot.replace("b", "b2"))
+    with pytest.raises(TrustboError, match="robots L, a, b2, but no poses of b of the team"):
+        read_driven(field, renamed, seen)
+
+
+def test_a_clock_that_was_set_back_is_named_with_the_speed(field):
+    poses, seen = driven(field, PLANNED * 3, hz=2)
+    late = poses.robot.eq("a") & poses.t.gt(100.2)
+    with pytest.raises(TrustboError, match=r"robot 'a' moves at .* clock"):
+        read_driven(field, poses.assign(t=poses.t - 60.2 * late), seen)

@@ -150,8 +150,12 @@ def read_tracks(
 def _leads(lead: str | None, robots: Sequence[str], workspace: Workspace | None) -> Sequence[str]:
     """Return the leads of a log: the given one, the robot that is not in the team, or all."""
     team = () if workspace is None else workspace.team.names
-    for name in team:
-        require_choice("robot of the team", name, robots)
+    absent = [name for name in team if name not in robots]
+    if absent:
+        raise TrustboError(
+            f"the table of poses has the robots {', '.join(robots)}, but no poses of "
+            f"{', '.join(absent)} of the team; use the names of the team in both tables."
+        )
     if lead is not None:
         return [require_choice("lead", lead, robots)]
     others = [name for name in robots if name not in team]
