@@ -516,3 +516,11 @@ def test_a_clock_that_was_set_back_is_named_with_the_speed(field):
     late = poses.robot.eq("a") & poses.t.gt(100.2)
     with pytest.raises(TrustboError, match=r"robot 'a' moves at .* clock"):
         read_driven(field, poses.assign(t=poses.t - 60.2 * late), seen)
+
+
+def test_ticks_of_a_gap_in_which_a_robot_has_no_poses_are_not_counted(field):
+    poses, seen = unbroken(np.arange(0.5, 60.0))
+    seen = seen[(seen.watcher != "a") | ~seen.t.between(25.0, 35.0)]  # a recorder that stopped
+    assert read_driven(field, poses, seen).contact_rate[:, 0].min() < 1.0
+    kept = poses[~(poses.robot.eq("a") & poses.t.between(25.0, 35.0))]
+    assert read_driven(field, kept, seen).contact_rate.min() == 1.0
