@@ -60,8 +60,10 @@ class Tuning(NamedTuple):
     """Whether the warm-up also tunes the mass matrix."""
 
 
-_OF_SCORES = Tuning(warmup=150, accept=0.85, depth=3, first_step=0.8, of_mass=False)
+_OF_SCORES = Tuning(warmup=150, accept=0.75, depth=2, first_step=0.8, of_mass=False)
 """Settings for scores; three steps of 0.8 standard deviations cross the posterior."""
+_SHORT_STEPS = _OF_SCORES._replace(accept=0.9, depth=3)
+"""Settings for scores if the usual ones fail a check."""
 _OF_PROGRAM = Tuning(warmup=300, accept=0.9, depth=10)
 """Settings for the full program of a model."""
 
@@ -295,9 +297,9 @@ def sample_by_nuts(
     )
     z = points.z[points.resample(_POINTS, rng)]
 
-    tuning = _OF_SCORES if density.is_gaussian else _OF_PROGRAM
+    tunings = [_OF_SCORES, _SHORT_STEPS] if density.is_gaussian else [_OF_PROGRAM]
     if warmup is not None:
-        tuning = tuning._replace(warmup=warmup)
+        tunings = [tuning._replace(warmup=warmup) for tuning in tunings]
     if density.is_gaussian:
         log_density = _in_jax(density)
         start = Start.near(z, chains, seed)
@@ -305,19 +307,22 @@ def sample_by_nuts(
     else:
         log_density, start, constrain = _program(density, z, chains, seed)
 
-    sampler = Chains(
-        log_density, compiled_without_data, tuning,
-        who=type(density.model).__name__, seed=seed, progress=progress,
-    )  # fmt: skip
-    samples = sampler.run(start, draws)
+    who = type(density.model).__name__
+    while True:
+        tuning = tunings.pop(0)
+        sampler = Chains(
+            log_density, compiled_without_data, tuning, who=who, seed=seed, progress=progress
+        )
+        samples = sampler.run(start, draws)
+        found = constrain(samples.points)
+        values = {name: found[name] for name in density.scores.priors}
+        by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
+        summary, complaints = complaints_of(by_chain, samples.fields["diverging"])
+        if not complaints or not tunings:
+            break
 
-    found = constrain(samples.points)
-    values = {name: found[name] for name in density.scores.priors}
     theta = density.model.theta(values, density.observations.resolution)
     c = density.draw_coefficients(theta, rng) if density.is_gaussian else found["coefficients"]
-
-    by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
-    summary, complaints = complaints_of(by_chain, samples.fields["diverging"])
     statistics = statistics_of({n: v.reshape(-1) for n, v in samples.fields.items()})
     return JointDraws(theta, c), statistics, summary, complaints
 
