@@ -151,8 +151,10 @@ class FunctionModel:
 
     def call(self, data: Data) -> None:
         """Run the function on the inputs that it takes."""
-        named = {**data, "features": FeatureNames(data["features"])}
-        self.function(**{name: named[name] for name in self.inputs})
+        inputs = {name: data[name] for name in self.inputs}
+        if "features" in inputs:
+            inputs["features"] = FeatureNames(inputs["features"])
+        self.function(**inputs)
 
     def sites(self, data: Data) -> dict[str, Site]:
         """Return the latent variables of the function by name, without computing anything.
