@@ -77,7 +77,8 @@ def _problem_of(folder: Path) -> str:
         free = shutil.disk_usage(folder).free
     except OSError as error:
         return error.strerror or str(error)
-    return "" if free >= _FREE else f"{free / 1e6:.0f} MB are free"
+    # The text does not change with the free space, or processes would warn again and again.
+    return "" if free >= _FREE else f"less than {_FREE / 1e6:.0f} MB are free"
 
 
 @cache
