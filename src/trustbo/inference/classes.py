@@ -178,13 +178,14 @@ def _draws(
 
     def visit(z: np.ndarray) -> np.ndarray:
         at_once = not density.is_gaussian and corrections > 1
-        log_p, coefficients = density.visit(z, rng, swept=at_once)
+        sites = density.run_ep_at(z) if at_once else None
+        log_p, coefficients = density.visit(z, rng, sites)
         visited.append(coefficients)
         if not at_once:
             return log_p
 
         some = np.flatnonzero(np.isfinite(log_p))
-        correction, c = _correction(density, z, coefficients, some, rng, corrections)
+        correction, c = _correction(density, z, coefficients, some, rng, corrections, sites)
         log_p[some] = correction
         corrected.append(c)
         return log_p
@@ -217,7 +218,7 @@ def _corrected(
 ) -> tuple[Points, np.ndarray]:
     """Draw coefficients (point, column) at all points, and correct the weights for errors of EP."""
     some = np.flatnonzero(points.weight * len(points.z) > _NEGLIGIBLE)
-    log_p, c = _correction(density, points.z, coefficients, some, rng, 1)
+    log_p, c = _correction(density, points.z, coefficients, some, rng)
 
     log_ratio = points.log_ratio.copy()
     log_ratio[some] += log_p - points.log_p[some]
@@ -230,16 +231,18 @@ def _correction(
     coefficients: Coefficients,
     some: np.ndarray,
     rng: np.random.Generator,
-    n: int,
+    n: int = 1,
+    sites: ep.Sites | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the log density of `some` points (some,) with n draws of the coefficients of each.
 
-    The mean of the estimated densities is exact. Also return one of the draws at each point (point,
-    column), chosen by its weight; at other points, any draw.
+    The mean of the estimated densities is exact; see `Density.log_joint` for `sites`. Also return
+    one of the draws at each point (point, column), chosen by its weight; at other points, any draw.
     """
     proposed = [coefficients.propose(np.arange(len(z)), rng) for _ in range(n)]
+    here = sites and sites.of(some)
     log_p = np.array(
-        [density.log_joint(z[some], c[some], rng, swept=n > 1) - q[some] for c, q in proposed]
+        [density.log_joint(z[some], c[some], rng, here) - q[some] for c, q in proposed]
     )
     c = proposed[0][0]
     if n > 1:

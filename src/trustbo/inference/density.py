@@ -187,12 +187,12 @@ class Density:
         return np.where(np.isfinite(log_p), log_p, -np.inf)
 
     def visit(
-        self, z: np.ndarray, rng: np.random.Generator, *, swept: bool = False
+        self, z: np.ndarray, rng: np.random.Generator, sites: ep.Sites | None = None
     ) -> tuple[np.ndarray, Coefficients]:
         """Compute the log density of `log_density` and the coefficients at each point.
 
-        If `swept`, EP is run at each point, which gives coefficients that are closer to the
-        posterior; the log density is then that of rates equal to the sites.
+        With the sites of `run_ep_at`, the coefficients are closer to the posterior; the log density
+        is then that of rates equal to the sites.
         """
         log_p = np.full(len(z), -np.inf)
         found = Coefficients.empty(len(z), self.columns.n)
@@ -200,7 +200,7 @@ class Density:
         with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
             theta, log_prior, some = self.possible(z)
             for where, chunk in chunks(theta, self._n_at_once):
-                fit, prior = self._swept(chunk) if swept else self._fit(chunk)
+                fit, prior = self._fit(chunk, sites and sites.of(some[where]))
                 log_p[some[where]] = fit.log_p
                 parts = coefficients_of(prior, fit, _DEVIATIONS, rng)
                 for values, part in zip(found, (*parts, fit.F.log_det), strict=True):
@@ -253,6 +253,18 @@ class Density:
                     break
             self.near = ep.Nearby.from_sites(joint, self.sites)
 
+    def run_ep_at(self, z: np.ndarray) -> ep.Sites:
+        """Find the EP sites at each point (point, score); they are 0 where the density is 0."""
+        shape = (len(z), *self.rates.y.shape)
+        found = ep.Sites(np.zeros(shape), np.zeros(shape))
+        with np.errstate(all="ignore"):  # as in `log_density`
+            theta, _, some = self.possible(z)
+            for where, chunk in chunks(theta, self._n_at_once):
+                sites = ep.swept(self._joint(chunk), self.sites, _LAST_SWEEPS)
+                for values, part in zip(found, sites, strict=True):
+                    values[some[where]] = part
+        return found
+
     def start(self) -> np.ndarray:
         """Return a starting point for the search for the mode or, with EP, the mode itself.
 
@@ -299,7 +311,11 @@ class Density:
         return Student(center, np.linalg.cholesky(cov))
 
     def log_joint(
-        self, z: np.ndarray, c: np.ndarray, rng: np.random.Generator, *, swept: bool = False
+        self,
+        z: np.ndarray,
+        c: np.ndarray,
+        rng: np.random.Generator,
+        sites: ep.Sites | None = None,
     ) -> np.ndarray:
         """Estimate the log joint density (draw,) of scores, coefficients and rates.
 
@@ -310,18 +326,19 @@ class Density:
             z: Normal scores (draw, score).
             c: Coefficients (draw, column).
             rng: Random number generator.
-            swept: Whether EP is run at each draw, for more even weights.
+            sites: EP sites at each draw, by default those near the theta of `run_ep`. The better
+                they are, the more even are the weights.
         """
         theta = self.theta(z)
         log_p = self.scores.log_prior(z)
         for where, chunk in chunks(theta):
             joint = self._joint(chunk)
             at = expected(self.blocks, joint.predictor, c[where])
-            if swept:
-                sites = ep.swept(joint, self.sites, _LAST_SWEEPS)
+            if sites is None:
+                here, _ = self.near.at(self.rates, joint.predictor.noise_sd)
             else:
-                sites, _ = self.near.at(self.rates, joint.predictor.noise_sd)
-            _, log_block = ep.draw_predictors(joint, at, sites, rng)
+                here = sites.of(where)
+            _, log_block = ep.draw_predictors(joint, at, here, rng)
             log_p[where] += joint.prior.log_density(c[where]) + log_block.sum(1)
         return log_p
 
@@ -334,21 +351,18 @@ class Density:
             drawn.append(mean + deviation[:, 0])
         return np.concatenate(drawn)
 
-    def _fit(self, theta: Theta) -> tuple[Fit, Prior]:
-        """Compute the evidence at each theta, as in `log_density`; also return the prior."""
+    def _fit(self, theta: Theta, sites: ep.Sites | None = None) -> tuple[Fit, Prior]:
+        """Compute the evidence at each theta, as in `visit`; also return the prior."""
         if not self.is_gaussian:
             joint = self._joint(theta)
-            return ep.nearby(joint, self.near), joint.prior
+            if sites is None:
+                fit = ep.nearby(joint, self.near)
+            else:
+                fit = evidence(self.blocks, joint.predictor, joint.prior, sites.lam, sites.y)
+            return fit, joint.prior
 
         predictor, prior = self.given(theta)
         return evidence(self.blocks, predictor, prior, self.rate_precision(predictor)), prior
-
-    def _swept(self, theta: Theta) -> tuple[Fit, Prior]:
-        """Fit the sites of EP at each theta; also return the prior."""
-        joint = self._joint(theta)
-        sites = ep.swept(joint, self.sites, _LAST_SWEEPS)
-        fit = evidence(self.blocks, joint.predictor, joint.prior, sites.lam, sites.y)
-        return fit, joint.prior
 
     def given(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
         """Return the distribution of the linear predictors and the prior at each theta."""

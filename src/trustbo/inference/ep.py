@@ -72,6 +72,10 @@ class Sites(NamedTuple):
         some = self.lam != 0.0
         return np.where(some, self.eta / np.where(some, self.lam, 1.0), 0.0)
 
+    def of(self, index: np.ndarray | slice) -> "Sites":
+        """Return the sites of the points with this index."""
+        return Sites(self.lam[index], self.eta[index])
+
     def close_to(self, other: "Sites", share: float) -> bool:
         """Return whether no site differs from another by more than a share of the largest one."""
         return all(

@@ -124,7 +124,7 @@ class PlaceEffect(Effect):
         """
         scale = 1.0
         if observations.visited is not None:  # draws from the prior have no places
-            scale = float(np.sqrt((self._scale(observations) ** 2).mean()))
+            scale = float(np.sqrt((_scale(observations, self.f_e) ** 2).mean()))
         factor = partial(_relative_sd, scale=scale)
         return [Pair("tau_s", "tau_e", "length_scale", factor)]
 
@@ -165,18 +165,15 @@ class PlaceEffect(Effect):
         """Return a Gaussian-process prior on cells and independent priors on bounds."""
         xp: Any = namespace(theta["tau_e"])
         places: Any = observations.visited
-        sd = xp.maximum(self._scale(observations) * theta["tau_e"][:, None], LEAST)
-        of_bounds = _precision_of_bounds(sd, _same_bound(places))
-        g_r = scale_at(_variation(observations), floor_of_robots(self.f_e))
-        of_robot = xp.maximum(g_r * theta["tau_r"][:, None], LEAST) ** -2.0
+        sd_e = _scale(observations, self.f_e) * theta["tau_e"][:, None]
+        of_bounds = _precision_of_bounds(xp.maximum(sd_e, LEAST), _same_bound(places))
+
+        sd_r = _scale(observations, floor_of_robots(self.f_e)) * theta["tau_r"][:, None]
+        of_robot = xp.maximum(sd_r, LEAST) ** -2.0
         of_robots = xp.repeat(of_robot, observations.n_robots - 1, axis=1)
 
         of_cells = [self._cells(theta, square) for square in places.squares]
         return None, [*of_cells, of_bounds, of_robots]
-
-    def _scale(self, observations: Observations) -> np.ndarray:
-        """Return the scale g(f_e) of the effects e in each visited bound, shape (bound,)."""
-        return scale_at(_variation(observations), self.f_e)
 
     def _cells(self, theta: Theta, square: np.ndarray) -> Any:
         """Compute the precision (point, cell, cell) of s from squared distances (cell, cell)."""
@@ -229,10 +226,10 @@ def _precision_of_bounds(sd: Any, same: np.ndarray) -> Any:
     return inverse / (sd[:, :, None] * sd[:, None, :])
 
 
-def _variation(observations: Observations) -> np.ndarray:
-    """Return `variation` of the mean line of sight in each visited bound, shape (bound,).
+def _scale(observations: Observations, floor: float) -> np.ndarray:
+    """Return the scale g(floor) of effects in each visited bound, shape (bound,).
 
-    It is 1, where the scale is 1, if line of sight is not predicted.
+    It depends on the mean line of sight in the bound, and is 1 if line of sight is not predicted.
     """
     places: Any = observations.visited
     if not sight_columns(observations.features):
@@ -242,7 +239,7 @@ def _variation(observations: Observations) -> np.ndarray:
     at = places.at[there]
     sight = observations.line_of_sight.mean(-1)[there]
     n = len(places.bounds)
-    return variation(np.bincount(at, sight, n) / np.bincount(at, minlength=n))
+    return scale_at(variation(np.bincount(at, sight, n) / np.bincount(at, minlength=n)), floor)
 
 
 def _inverse(A: Any) -> Any:
