@@ -276,6 +276,31 @@ def test_robots_differ_by_at_least_a_tenth_where_the_map_predicts_whole_contact(
     assert inside.var(0).mean() == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_missions_that_always_lose_contact_in_the_same_bound_are_fitted(seed):
+    rng = np.random.default_rng(0)
+    path = [(0, k) for k in range(13)]
+    z = np.ones((12, 3, 3))
+    z[..., :2] = 0.9
+    features = ("traversability", "visibility", "line_of_sight")
+    z[0, :, 2] = 0.8  # the map predicts whole contact in all other bounds
+    missions = []
+    for _ in range(6):
+        y = np.ones((12, 3))
+        y[0] = [0.9, 0.78, 0.86] + 0.03 * rng.standard_normal(3)
+        missions.append(
+            tb.Mission.from_arrays(
+                path, z, y.round(2), features=features, n_ticks=np.full(y.shape, 100)
+            )
+        )
+
+    posterior = fit(missions, seed=seed, progress=False, latent=False)
+
+    assert posterior.attrs["k_hat"] <= importance.MAX_KHAT
+    assert posterior.attrs["kish"] > 400.0
+    assert posterior.attrs["log_evidence"] == pytest.approx(940.6, abs=0.3)  # alike for all seeds
+
+
 def test_censored_rates_that_are_mostly_zero_are_fitted():
     """EP at the mode alone gives uneven weights here (k-hat 1.6 or more with five seeds)."""
     rng = np.random.default_rng(4)

@@ -58,6 +58,19 @@ def test_two_modes_share_their_mass_or_the_weights_are_refused(starts):
     assert n_accepted >= 5
 
 
+def test_a_search_that_ends_on_a_ridge_goes_on():
+    def log_density(z):
+        return -5000.0 * (z[:, 1] - z[:, 0] ** 2) ** 2 - 2.0 * (z[:, 0] - 2.0) ** 2
+
+    start = np.array([-3.0, 5.0])
+
+    ends = np.array([importance.climb(log_density, start), importance.climb_on(log_density, start)])
+
+    once, again = log_density(ends)
+    assert once < -10.0  # otherwise, this ridge does not test `climb_on`
+    assert again > -4.0
+
+
 def test_a_density_may_vanish_in_places():
     def log_density(z):
         return np.where(z[:, 0] > 0.0, stats.norm.logpdf(z).sum(1), -np.inf)

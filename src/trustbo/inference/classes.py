@@ -15,7 +15,7 @@ from trustbo.display import slow_bar
 from trustbo.inference import ep
 from trustbo.inference.density import Coefficients, Density, JointDraws, at
 from trustbo.inference.engine import inputs
-from trustbo.inference.importance import MAX_KHAT, Points, Student, sample
+from trustbo.inference.importance import MAX_KHAT, ROUNDS, Points, Student, climb_on, sample
 from trustbo.inference.latent import (
     N_PRIOR,
     N_TRAJECTORIES,
@@ -45,6 +45,8 @@ _SIZE = 256
 """Points per round of the importance sampler."""
 _LAST_SIZE = 1024
 """Points per round of the last attempt, if rates are Gaussian."""
+_LAST_ROUNDS = 12
+"""Largest number of rounds of the last attempt. Some curved posteriors need more than usual."""
 _CORRECTIONS = 4
 """Number of draws of the coefficients by which EP is corrected at each point in the last attempt,
 if rates are not Gaussian."""
@@ -135,7 +137,9 @@ def by_importance(
     """Take n draws by importance sampling; return the draws, statistics (draw,) and a summary.
 
     `first` is the first proposal. By default, or if its weights are uneven, the first proposal is
-    found by a search for the mode.
+    found by a search for the mode. If these weights are uneven as well, the search goes on from its
+    end, and there are more rounds, which are larger. Unless rates are Gaussian, EP is corrected at
+    each point instead of drawing larger rounds.
     """
     rng = np.random.default_rng(seed)
     last_size = _LAST_SIZE if density.is_gaussian else _SIZE
@@ -147,8 +151,8 @@ def by_importance(
         if density.n_scores >= _MANY_SCORES:
             size = 4 * size
 
-        corrections = 1 if attempts else _CORRECTIONS
-        drawn, log_p, summary = _draws(density, n, size, rng, proposal, corrections)
+        is_last = not attempts
+        drawn, log_p, summary = _draws(density, n, size, rng, proposal, is_last)
         if summary["k_hat"] <= MAX_KHAT or not attempts:
             return drawn, {"lp": log_p}, summary
 
@@ -159,25 +163,27 @@ def _draws(
     size: int,
     rng: np.random.Generator,
     first: Student | None,
-    corrections: int,
+    is_last: bool,
 ) -> tuple[JointDraws, np.ndarray, dict[str, Any]]:
     """Take n draws, beginning with the proposal `first` or with a search for the mode.
 
-    Unless rates are Gaussian, the density of EP is corrected at the points in the end. With several
-    `corrections`, EP is run and corrected at each visited point instead, so that later proposals
-    are fitted to the corrected density.
+    Unless rates are Gaussian, the density of EP is corrected at the points in the end. In the last
+    attempt, EP is run and corrected at each visited point instead, so that later proposals are
+    fitted to the corrected density.
     """
     if first is None:
         start = density.start()
+        if is_last:
+            start = climb_on(density.log_density, start)
     else:
         start = first.center
         density.run_ep(density.theta(start[None]))
 
+    at_once = is_last and not density.is_gaussian
     visited: list[Coefficients] = []
     corrected: list[np.ndarray] = []
 
     def visit(z: np.ndarray) -> np.ndarray:
-        at_once = not density.is_gaussian and corrections > 1
         sites = density.run_ep_at(z) if at_once else None
         log_p, coefficients = density.visit(z, rng, sites)
         visited.append(coefficients)
@@ -185,14 +191,15 @@ def _draws(
             return log_p
 
         some = np.flatnonzero(np.isfinite(log_p))
-        correction, c = _correction(density, z, coefficients, some, rng, corrections, sites)
+        correction, c = _correction(density, z, coefficients, some, rng, _CORRECTIONS, sites)
         log_p[some] = correction
         corrected.append(c)
         return log_p
 
     points = sample(
         density.log_density, start[None], rng,
-        size=size, defensive=density.defensive, first=first, visit=visit,
+        size=size, most=_LAST_ROUNDS if is_last else ROUNDS,
+        defensive=density.defensive, first=first, visit=visit,
     )  # fmt: skip
     coefficients = Coefficients.joined(visited)
     proposal = points.proposal.text

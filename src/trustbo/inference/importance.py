@@ -33,6 +33,8 @@ MAX_KHAT = 0.7
 """Largest k-hat of acceptable results."""
 ENOUGH = 400.0
 """Effective number of points at which sampling stops."""
+ROUNDS = 8
+"""Largest number of rounds by default."""
 DEGREES = 8.0
 """Degrees of freedom of the proposals."""
 _PRIOR_SCALE = 1.2
@@ -65,6 +67,8 @@ _N_STEPS = 40
 """Largest number of steps of a search for a mode."""
 _CLOSE = 0.1
 """A search for a mode ends when a step gains less than this log density."""
+_LITTLE = 1.0
+"""Gain in log density below which a search is not repeated from its end."""
 _LARGEST_COST = 1e10
 """Replacement for an infinite -log density, which searches and finite differences cannot use."""
 _LEAST_CURVATURE = 0.3
@@ -252,7 +256,7 @@ def sample(
     *,
     size: int = 256,
     enough: float = ENOUGH,
-    most: int = 8,
+    most: int = ROUNDS,
     defensive: Callable[[Student], Student] | None = None,
     first: Student | None = None,
     visit: LogDensity | None = None,
@@ -380,6 +384,18 @@ def climb(log_density: LogDensity, start: np.ndarray) -> np.ndarray:
         cost, np.zeros(d), jac=True, method="L-BFGS-B", bounds=farthest, options=options
     )
     return start + width * found.x
+
+
+def climb_on(log_density: LogDensity, start: np.ndarray) -> np.ndarray:
+    """Repeat `climb` from where it ends, which may be a ridge, until it gains little."""
+    value = log_density(start[None])[0]
+    while True:
+        end = climb(log_density, start)
+        before, value = value, log_density(end[None])[0]
+        if not value > before + _LITTLE:
+            return start
+
+        start = end
 
 
 def fit_mode(log_density: LogDensity, mode: np.ndarray) -> Student:
