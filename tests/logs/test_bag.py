@@ -118,6 +118,45 @@ def test_the_message_about_a_missing_contact_topic_names_its_namespace(driven, w
     assert len(read_bag(path, workspace, contact="/ugv/{robot}/contact")) == 2
 
 
+def bound_of_both(*looks):
+    """A bag of one bound of 60 s; `looks` are the contact messages of r1, r2 always has contact."""
+    log = Log()
+    log.bound(1.0, 0, 2, 0)
+    log.bound(1.0, 1, 1, 1)
+    log.contact("r1", *looks)
+    log.contact("r2", *((k + 1.5, True) for k in range(60)))
+    log.text(61.0, "/mission/status", "ok")
+    log.messages.sort(key=lambda message: message[0])
+    return log
+
+
+SEEN = np.random.default_rng(0).random(60) < 0.6
+
+
+def test_a_robot_without_a_topic_of_contact_is_unknown_with_a_warning(workspace, tmp_path):
+    log = bound_of_both()
+    with pytest.warns(UserWarning, match="lacks /r1/contact, so"):
+        (one,) = read_bag(log.save(tmp_path / "bag"), workspace)
+    np.testing.assert_array_equal(one.contact_rate, [[np.nan, 1.0]])
+
+
+def test_a_robot_that_sends_only_during_contact_is_warned_of(workspace, tmp_path):
+    log = bound_of_both(*((k + 1.5, True) for k in range(60) if SEEN[k]))
+    with pytest.warns(UserWarning, match="all contact messages of r1 say"):
+        read_bag(log.save(tmp_path / "bag"), workspace)
+
+    log = bound_of_both(*((k + 1.5, bool(SEEN[k])) for k in range(60)))
+    (one,) = read_bag(log.save(tmp_path / "whole"), workspace)
+    np.testing.assert_array_equal(one.contact_rate, [[SEEN.mean(), 1.0]])
+
+
+def test_a_robot_whose_messages_lie_outside_the_bounds_is_warned_of(workspace, tmp_path):
+    log = bound_of_both(*((k + 3601.5, bool(SEEN[k])) for k in range(60)))
+    with pytest.warns(UserWarning, match="all contact messages of r1 lie outside"):
+        (one,) = read_bag(log.save(tmp_path / "bag"), workspace)
+    np.testing.assert_array_equal(one.contact_rate, [[np.nan, 1.0]])
+
+
 @pytest.mark.parametrize("kind", ["log.bag", "sqlite3"])
 def test_a_bag_that_was_split_is_read_as_one(kind, workspace, tmp_path):
     whole = Log(1 if kind == "log.bag" else 2)

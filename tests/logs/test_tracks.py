@@ -372,6 +372,53 @@ def test_readings_further_apart_than_a_tick_are_warned_of_with_the_remedy(field,
     assert one.contact_rate.min() == 1.0
 
 
+@pytest.mark.parametrize("interval", [0.9, 0.7, 0.5, 0.3])
+@pytest.mark.parametrize("jitter", [0.0, 0.05])
+def test_readings_closer_together_than_a_tick_are_warned_of_with_the_remedy(
+    field, interval, jitter
+):
+    rng = np.random.default_rng(0)
+    times = np.arange(0.1, 60.0, interval)
+    times = times + rng.uniform(-jitter, jitter, len(times)) * interval
+    poses, seen = unbroken(times)
+    is_found = rng.random(len(times)) < 0.7
+    found = seen[np.tile(is_found, 2)]
+    with pytest.warns(UserWarning, match="only .* apart.* pass .* tick=") as caught:
+        high = read_driven(field, poses, found)
+
+    advised = float(str(caught[0].message).partition("tick=")[2].split(",")[0])
+    assert advised == pytest.approx(interval, rel=0.05)
+    one = read_driven(field, poses, found, tick=advised)
+    assert abs(one.contact_rate.mean() - is_found[times > 10.0].mean()) < 0.05
+    assert high.contact_rate.mean() > one.contact_rate.mean()
+
+
+def test_irregular_readings_of_about_a_tick_are_not_warned_of(field):
+    rng = np.random.default_rng(0)
+    times = np.arange(0.5, 60.0) + rng.uniform(-0.25, 0.25, 60)
+    poses, seen = unbroken(times)
+    read_driven(field, poses, seen[np.tile(rng.random(60) < 0.7, 2)])
+
+
+def test_a_robot_without_poses_did_not_take_part(field):
+    poses, seen = driven(field, PLANNED)
+    there = poses[poses.robot != "b"]
+    with pytest.warns(UserWarning, match="no poses of b of the team") as caught:
+        one = read_driven(field, there, seen[seen.watcher != "b"])
+    assert len(caught) == 1  # it is not also said that no detection names b
+    assert np.isnan(one.contact_rate[:, 1]).all()
+    np.testing.assert_array_equal(
+        one.contact_rate[:, 0], read_driven(field, poses, seen).contact_rate[:, 0]
+    )
+
+
+def test_the_message_about_a_missed_cell_names_a_gap_between_poses(field):
+    poses, seen = driven(field, PLANNED)
+    gap = poses[~poses.t.between(8.0, 32.0)]
+    with pytest.raises(TrustboError, match=r"never enters .* unknown for up to 2"):
+        read_driven(field, gap, seen)
+
+
 @pytest.mark.parametrize(
     "column",
     [lambda t: t % 2 < 1, lambda t: (t % 2 < 1) * 1, lambda t: np.where(t % 2 < 1, "yes", "no"),

@@ -25,7 +25,7 @@ import numpy as np
 import pandas as pd
 
 from trustbo.data import Cell, Mission, require_unit_interval
-from trustbo.errors import TrustboError, require_pair, require_whole
+from trustbo.errors import TrustboError, require_pair, require_whole, warn
 from trustbo.files import FilePath, to_path
 from trustbo.logs.recorders import (
     joined,
@@ -33,7 +33,7 @@ from trustbo.logs.recorders import (
     without_repeated_statuses,
     without_repeats,
 )
-from trustbo.logs.statuses import ends_of, warn_of_ends
+from trustbo.logs.statuses import ends_of, in_bounds, warn_of_ends, warn_of_robots
 from trustbo.logs.table import read_table
 from trustbo.workspace import Workspace
 
@@ -73,8 +73,9 @@ def read_bag(
             differ, a bound has different statuses, or `Mission` rejects the data.
 
     Warns:
-        UserWarning: A status ends a bound although contact messages continue, or no contact message
-            was sent in a bound.
+        UserWarning: A status ends a bound although contact messages continue, no contact message
+            was sent in a bound, or the topic of a robot is missing, has no message in any bound, or
+            has messages only during contact.
 
     Example:
         >>> missions = tb.logs.read_bag("log.bag", workspace)
@@ -108,6 +109,8 @@ def read_bag(
     statuses = without_repeated_statuses(statuses, markers, bounds)
     ends = ends_of(bounds, statuses, ticks)
     warn_of_ends(bounds, ends, looks.index)
+    ticks = in_bounds(ticks, bounds, ends)
+    warn_of_robots(ticks, looks["topic"].map(of_topic).unique())
     tables = [
         _table(driven, ticks, ends, workspace.team.names).assign(mission=mission)
         for mission, driven in missions
@@ -198,20 +201,30 @@ def _require_topics(
     contact: str,
     contacts: Sequence[str],
 ) -> None:
-    """Raise TrustboError that lists missing topics and the argument that names other topics."""
+    """Raise TrustboError that lists missing topics and the argument that names other topics.
+
+    If some robots have topics of contact, the others may not have taken part, which is warned of.
+    """
 
     def namespace(topic: str, other: str) -> str:
         """Return what precedes a missing topic in the bag, or an example."""
         return next((name.removesuffix(topic) for name in there if name.endswith(topic)), other)
 
-    missing = [topic for topic in (bounds, *contacts) if topic not in there]
-    if not missing:
+    of_robots = [topic for topic in contacts if topic not in there]
+    if bounds in there and len(of_robots) < len(contacts):
+        if of_robots:
+            warn(
+                f"{_listed(paths)} lacks {', '.join(of_robots)}, so the contact of these robots is "
+                "unknown; rename the topics if the robots took part."
+            )
         return
 
+    missing = [*of_robots]
     remedies = []
-    if bounds in missing:
+    if bounds not in there:
+        missing.insert(0, bounds)
         remedies.append(f'prefix="{namespace(_BOUND, "/fleet")}" for {_BOUND}')
-    if of_robots := [topic for topic in missing if topic != bounds]:
+    if of_robots:
         space = namespace(of_robots[0], "")
         remedies.append(f'contact="{space + contact if space else "/{robot}/sees"}"')
     found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(there.items()))
@@ -235,7 +248,10 @@ def _marker(time: Any, text: Any) -> tuple[int, int, Cell, tuple[Cell, ...]]:
 def _table(
     bounds: pd.DataFrame, ticks: pd.DataFrame, ends: pd.DataFrame, robots: Sequence[str]
 ) -> pd.DataFrame:
-    """Return a mission as a table: rows of its planned cells, then rows of its bounds."""
+    """Return a mission as a table: rows of its planned cells, then rows of its bounds.
+
+    `ticks` are those of `in_bounds`.
+    """
     driven = tuple(bounds["cell"])
     planned = bounds["path"].iloc[0]
     left_path = planned[:1] == driven[:1] and planned[: len(driven)] != driven
@@ -246,14 +262,10 @@ def _table(
     tables = [pd.DataFrame(cells, columns=["bound", "row", "col"]).drop_duplicates()]
 
     of_bounds = ends.drop_duplicates("row").set_index("row")
-    for i, begin, k, (row, col), _, until, _ in bounds.iloc[1:].itertuples():
+    for i, begin, k, (row, col), *_ in bounds.iloc[1:].itertuples():
+        looks = ticks.loc[ticks["row"] == i]
         has_status = i in of_bounds.index
-        if has_status:
-            end = of_bounds.loc[i, "end"]
-            looks = ticks.loc[begin + 1 : end]
-        else:
-            looks = ticks.loc[begin + 1 : until]
-            end = max(looks.index, default=begin)
+        end = of_bounds.loc[i, "end"] if has_status else max(looks.index, default=begin)
 
         duration = (end - begin) / _NANOSECONDS if end > begin else np.nan
         status = of_bounds.loc[i, "status"] if has_status else "ok"

@@ -50,8 +50,7 @@ def crossings_of(
         if len(edges) < len(path) and cell == path[len(edges)]:
             edges.append(k)
 
-    short = f" The log lasts {n * tick:g} s; give {UNITS}." if n * tick < _SHORT else ""
-    _require_route(path, edges, entered, short)
+    _require_route(path, edges, entered, _doubts_of(ticks, n, tick))
 
     end = _end_of_visit(visits, edges[-1], path[len(edges) - 1], GAP / tick, n)
     if len(edges) < len(path) and end < n:
@@ -61,6 +60,21 @@ def crossings_of(
             "read as ended there."
         )
     return stations, np.array([*edges[1:], end])
+
+
+def _doubts_of(ticks: Sequence[int], n: int, tick: float) -> str:
+    """Return the end of messages: why the poses of the lead, known at `ticks`, may be wrong."""
+    if n * tick < _SHORT:
+        return f" The log lasts {n * tick:g} s; give {UNITS}."
+
+    gap = float(np.diff([-1, *ticks, n]).max() - 1) * tick
+    if gap <= GAP:
+        return ""
+
+    return (
+        f" The poses of the lead are unknown for up to {gap:.3g} s, because only times of at most "
+        f"{GAP:g} s between poses are interpolated; add interpolated poses, and give {UNITS}."
+    )
 
 
 def _without_excursions(

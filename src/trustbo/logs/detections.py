@@ -16,6 +16,12 @@ _OFTEN = 0.03
 """Share of intervals between detections that may be shorter than those of the detector."""
 _LONGER = 1.04
 """Interval between readings, in ticks, from which ticks without a reading are warned of."""
+_SHORTER = 0.92
+"""Interval between readings, in ticks, below which ticks with two readings are warned of."""
+_NEXT = 1.5
+"""Time between two detections, in intervals of the detector, up to which none lies between them."""
+_REGULAR = 0.9
+"""Least time between nearly all detections of a regular detector, in its intervals."""
 _LEAST_SINGLE = 0.2
 """Least share of the times between detections that are one interval of the detector."""
 _READ = ("t", "watcher", "seen")
@@ -126,7 +132,11 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def warn_of_names(
-    looks: pd.DataFrame, unknown: pd.DataFrame, leads: Sequence[str], team: Sequence[str]
+    looks: pd.DataFrame,
+    unknown: pd.DataFrame,
+    leads: Sequence[str],
+    team: Sequence[str],
+    robots: Sequence[str],
 ) -> None:
     """Warn of detections that are ignored because of their names, and of robots without detections.
 
@@ -135,8 +145,8 @@ def warn_of_names(
         unknown: All other detections.
         leads: Robots that are watched.
         team: Robots that watch.
+        robots: Robots with poses.
     """
-    robots = {*team, *leads, *looks["robot"], *looks["lead"]}
     if strangers := [name for name in unknown["robot"].unique() if name not in robots]:
         warn(
             f"detections by {_listed(strangers)} are ignored, because the table of poses lacks "
@@ -160,7 +170,8 @@ def warn_of_names(
             f"detections by and of {_listed(others)} are ignored, because they are neither the "
             f"lead nor in the team ({', '.join(team)}); if a robot was renamed, use one name."
         )
-    if silent := [name for name in dict.fromkeys([*team, *leads]) if name not in named]:
+    present = [name for name in dict.fromkeys([*team, *leads]) if name in robots]
+    if silent := [name for name in present if name not in named]:
         warn(f"no detection names {', '.join(silent)}; their contact is 0.")
     _warn_of_the_lead(looks, leads, team)
 
@@ -247,13 +258,22 @@ def _time_outside(tracks: pd.DataFrame, looks: pd.DataFrame) -> np.ndarray:
 
 
 def _warn_of_intervals(looks: pd.DataFrame, tick: float) -> None:
-    """Warn of readings that are further apart than a tick, or much closer together."""
+    """Warn of readings that are further apart than a tick, or closer together."""
     ordered = looks.sort_values("t")
     gaps = ordered.groupby(["robot", "lead"])["t"].diff().to_numpy()
     watchers = ordered["robot"].to_numpy()
-    intervals = {name: _interval(gaps[watchers == name]) for name in np.unique(watchers)}
-    slow = {str(name): apart for name, apart in intervals.items() if apart > _LONGER * tick}
+    slow: dict[str, float] = {}
+    fast: dict[str, float] = {}
+    for name in np.unique(watchers):
+        of_watcher = gaps[watchers == name]
+        apart = interval_of(of_watcher)
+        if apart > _LONGER * tick:
+            slow[str(name)] = apart
 
+        # If every reading is a detection, the second one in a tick changes nothing.
+        misses = (of_watcher > _NEXT * apart).mean() > _OFTEN
+        if apart < _SHORTER * tick and misses and _is_regular(of_watcher, apart):
+            fast[str(name)] = apart
     all_gaps = gaps[~np.isnan(gaps)]
     short = all_gaps[all_gaps < 0.5 * tick]
     least = float(np.quantile(all_gaps, _OFTEN)) if all_gaps.size else np.nan
@@ -264,17 +284,24 @@ def _warn_of_intervals(looks: pd.DataFrame, tick: float) -> None:
             f"detections {by}are {apart:.4g} s or more apart, but every tick of {tick:g} s without "
             f"a detection counts as lost contact; pass tick={apart:.4g}."
         )
-    elif len(short) > max(_OFTEN * len(all_gaps), _MANY):
-        apart = float(np.quantile(short, 0.05))
+    elif fast or len(short) > max(_OFTEN * len(all_gaps), _MANY):
+        apart = min(fast.values()) if fast else float(np.quantile(short, 0.05))
+        by = f"by {_listed(fast)} " if fast else "of one robot by another "
         warn(
-            f"detections of one robot by another are only {apart:.3g} s apart, but one detection "
+            f"detections {by}are only {apart:.3g} s apart, but one detection "
             f"counts as contact in a whole tick of {tick:g} s; pass the interval between two "
-            f"readings of the detector, such as tick={apart:.3g}."
+            f"readings of the detector, such as tick={apart:.3g}, or if those of other robots are "
+            "further apart, leave out some scans of the robot."
         )
 
 
-def _interval(gaps: np.ndarray) -> float:
-    """Return the interval between readings of a detector, s; NaN if it is unknown.
+def _is_regular(gaps: np.ndarray, apart: float) -> bool:
+    """Return whether hardly any detections are much closer together than the interval `apart`."""
+    return float(np.nanquantile(gaps, _OFTEN)) > _REGULAR * apart
+
+
+def interval_of(gaps: np.ndarray) -> float:
+    """Return the interval between readings of a detector; NaN if it is unknown.
 
     Times between detections are multiples of the interval, because some readings detect nothing.
     """
@@ -282,6 +309,10 @@ def _interval(gaps: np.ndarray) -> float:
     if not known.size:
         return np.nan
 
-    single = known[known < 1.5 * np.quantile(known, _OFTEN)]
+    single = known[known < _NEXT * np.quantile(known, _OFTEN)]
     is_known = len(single) > max(_MANY, _LEAST_SINGLE * len(known))
-    return float(np.median(single)) if is_known else np.nan
+    if not is_known:
+        return np.nan
+
+    # If readings are irregular, the shortest times are those of few readings.
+    return float(np.median(known[known < _NEXT * np.median(single)]))

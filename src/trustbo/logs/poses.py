@@ -94,8 +94,8 @@ def _check_speed(name: str, t: np.ndarray, speed: np.ndarray, moves: np.ndarray)
     if speed.max() > _FASTEST:
         raise TrustboError(
             f"robot {name!r} moves at {speed.max():.3g} m/s at t = {t[speed.argmax()]:.9g} s; "
-            "leave out poses without a fix, such as (0, 0), give x and y in metres, and correct "
-            "the times if its clock was set back."
+            "leave out poses without a fix, such as (0, 0), give x and y in metres, correct the "
+            "times if its clock was set back, and keep about one pose per second if they are noisy."
         )
 
 

@@ -1,14 +1,21 @@
-"""Statuses in a bag: the bound to which each belongs, and doubts about where bounds end."""
+"""Bounds in a bag: their statuses and contact messages, and doubts about both."""
+
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 
 from trustbo.errors import TrustboError, warn
+from trustbo.logs.detections import interval_of
 
 _LATE = 1_000_000_000
 """Time after a marker in which the status of the bound before may arrive, ns."""
 _SMALL = 0.1
 """Share of the contact messages of a bound that is small."""
+_LATER = 1.5
+"""Time since a robot's last contact message above which messages are missing, in usual times."""
+_MANY_MISSING = 0.1
+"""Share of messages after which others are missing from which it is warned of."""
 _ABORTED = "aborted"
 """Status that a mission may also have after the status of its last bound."""
 
@@ -64,6 +71,52 @@ def _require_one_status(bounds: pd.DataFrame, ends: pd.DataFrame) -> None:
             raise TrustboError(
                 f"bound {bound['bound']} of mission {bound['mission']} has the statuses "
                 f"{', '.join(statuses.unique())}; leave out all but the one at its end."
+            )
+
+
+def in_bounds(ticks: pd.DataFrame, bounds: pd.DataFrame, ends: pd.DataFrame) -> pd.DataFrame:
+    """Return the ticks after the marker of a bound and up to its end, with the `row` of the bound.
+
+    Args:
+        ticks: Contact of each `robot`, indexed and sorted by time, ns.
+        bounds: Markers in order, as for `ends_of`, with the time `until` the next one, ns.
+        ends: Statuses of the bounds; a bound without a status lasts until the next marker.
+    """
+    until = bounds["until"].to_numpy(copy=True)
+    first = ends.drop_duplicates("row")
+    until[first["row"].astype(int)] = first["end"]
+
+    times = ticks.index.to_numpy()
+    row = np.searchsorted(bounds["begin"].to_numpy(), times) - 1
+    is_in_bound = (row >= 0) & (bounds["bound"].to_numpy()[row] > 0) & (times <= until[row])
+    return ticks.assign(row=row).loc[is_in_bound]
+
+
+def warn_of_robots(ticks: pd.DataFrame, robots: Sequence[str]) -> None:
+    """Warn of robots without messages in bounds, and of robots that send only during contact.
+
+    Args:
+        ticks: Contact of each `robot` in bounds, as from `in_bounds`.
+        robots: Robots with messages.
+    """
+    present = set(ticks["robot"])
+    if outside := [robot for robot in robots if robot not in present]:
+        warn(
+            f"all contact messages of {', '.join(outside)} lie outside the bounds, so the contact "
+            "is unknown; check the clocks of these robots."
+        )
+
+    times = ticks.index.to_series()
+    gaps = times.groupby([ticks["robot"].to_numpy(), ticks["row"].to_numpy()]).diff().to_numpy()
+    for robot, of_robot in ticks.assign(gap=gaps).groupby("robot"):
+        apart = of_robot["gap"].to_numpy()
+        is_late = apart > _LATER * interval_of(apart)
+        always = np.all(of_robot["contact"].to_numpy())
+        if always and is_late.sum() > _MANY_MISSING * len(is_late):
+            warn(
+                f"all contact messages of {robot} say that there is contact, and often some are "
+                "missing; if they are sent only during contact, also send those without contact. "
+                "Otherwise, the contact rate is 1."
             )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from trustbo.data import STATUSES, Mission, Station
-from trustbo.errors import TrustboError, require_choice, require_positive
+from trustbo.errors import TrustboError, require_choice, require_positive, warn
 from trustbo.logs.crossings import crossings_of
 from trustbo.logs.detections import (
     read_tables,
@@ -90,7 +90,8 @@ def read_tracks(
     Warns:
         UserWarning: A watcher is unknown, detections lie outside the time of the poses, the lead
             detects robots, the interval of detections is not the tick, poses are more than 5 s
-            apart, a robot is never seen or never watches, or the lead leaves the planned path.
+            apart, a robot has no poses, is never seen or never watches, or the lead leaves the
+            planned path.
 
     Example:
         >>> missions = tb.logs.read_tracks("poses.csv", "detections.csv", window=20.0)
@@ -141,7 +142,7 @@ def read_tracks(
             "shorter window."
         )
 
-    warn_of_names(looks, unknown, leads, team)
+    warn_of_names(looks, unknown, leads, team, robots)
     warn_of_times(tracks, looks, tick)
     warn_of_gaps(tracks, looks, pairs, leads)
     return missions
@@ -149,19 +150,28 @@ def read_tracks(
 
 def _leads(lead: str | None, robots: Sequence[str], workspace: Workspace | None) -> Sequence[str]:
     """Return the leads of a log: the given one, the robot that is not in the team, or all."""
-    team = () if workspace is None else workspace.team.names
+    if lead is not None:
+        require_choice("lead", lead, robots)
+    if workspace is None:
+        return robots if lead is None else [lead]
+
+    team = workspace.team.names
+    others = [name for name in robots if name not in team]
+    leads = others if lead is None else [lead]
     absent = [name for name in team if name not in robots]
-    if absent:
+    if absent and (len(others) > 1 or len(absent) == len(team)):
         raise TrustboError(
             f"the table of poses has the robots {', '.join(robots)}, but no poses of "
             f"{', '.join(absent)} of the team; use the names of the team in both tables."
         )
-    if lead is not None:
-        return [require_choice("lead", lead, robots)]
-    others = [name for name in robots if name not in team]
-    if workspace is not None and len(others) != 1:
+    if absent:
+        warn(
+            f"there are no poses of {', '.join(absent)} of the team, so their contact in this "
+            "mission is unknown; add the poses if they took part."
+        )
+    if len(leads) != 1:
         raise TrustboError(f"a log with a map has one lead; pass lead=, one of {others or robots}.")
-    return others
+    return leads
 
 
 def _pairs(places: pd.DataFrame, looks: pd.DataFrame) -> pd.DataFrame:

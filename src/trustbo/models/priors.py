@@ -205,7 +205,7 @@ class Priors(Summary):
         scaled by 5, and a trust of 0 corresponds to a rate of 0.5.
 
         On the terrain of the paper's notebook, 81 % of the contact rates drawn from these priors
-        are in [0, 1], compared with 22 % of those drawn from `default`.
+        are in [0, 1], compared with 24 % of those drawn from `default`.
         """
         require_choice("family", family, FAMILIES)
         slope, zero = FAMILIES[family].line_of_sight
