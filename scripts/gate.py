@@ -2,6 +2,9 @@
 
     python scripts/gate.py              list them; the exit status is 1 if there are any
     python scripts/gate.py stamp NAME   record that NAME was computed with the present commit
+    python scripts/gate.py same NAME --part COMMAND
+                                        record that COMMAND, a part of NAME, gives the same results
+                                        as before the change of the code
 
 `benchmarks/provenance.toml` states from which commit each table, figure and notebook comes, and
 which code it measures. An entry is stale if this code has changed since the commit. Changes of
@@ -17,6 +20,7 @@ with a title, has this title.
 import argparse
 import ast
 import functools
+import json
 import re
 import subprocess
 import sys
@@ -46,6 +50,15 @@ class Entry(NamedTuple):
     commit: str
     code: tuple[str, ...]
     """Pathspecs of git; empty for results of earlier versions, which do not become stale."""
+    same: str = ""
+    """Later commit with which a part of them was computed again, and equal; "" if there is none."""
+    part: str = ""
+    """Command that computes this part."""
+
+    @property
+    def checked(self) -> str:
+        """Last commit that gives these results, as far as it was checked."""
+        return self.same or self.commit
 
 
 def main() -> None:
@@ -53,16 +66,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command")
     stamped = commands.add_parser("stamp", help="write the present commit into entries")
-    stamped.add_argument("names", nargs="+", metavar="NAME")
+    same = commands.add_parser("same", help="record that a part was computed again, and is equal")
+    for command in (stamped, same):
+        command.add_argument("names", nargs="+", metavar="NAME")
+    same.add_argument("--part", required=True, metavar="COMMAND", help="what was run")
     given = parser.parse_args()
 
-    if given.command == "stamp":
+    if given.command is not None:
         for name in given.names:
-            print(f"{name}: {stamp(ROOT, name)}")
+            print(f"{name}: {stamp(ROOT, name, getattr(given, 'part', ''))}")
         return
 
     found = list(faults(ROOT))
     print("\n".join(found) or "all tables, figures and notebooks are of the present code")
+    if parts := [f"{e.name} ({e.part})" for e in read_manifest(ROOT) if e.same]:
+        print(f"of these, only a part was run again: {', '.join(parts)}")
     sys.exit(bool(found))
 
 
@@ -96,6 +114,8 @@ def read_manifest(root: Path) -> list[Entry]:
             run=table["run"],
             commit=table["commit"],
             code=tuple(path for item in table["code"] for path in groups.get(item, [item])),
+            same=table.get("same", ""),
+            part=table.get("part", ""),
         )
         for name, table in tables.items()
     ]
@@ -133,13 +153,13 @@ def why_stale(root: Path, entry: Entry) -> str:
         return "nobody has recorded with which commit it was computed"
 
     in_history = subprocess.run(
-        ["git", "-C", str(root), "merge-base", "--is-ancestor", entry.commit, "HEAD"],
+        ["git", "-C", str(root), "merge-base", "--is-ancestor", entry.checked, "HEAD"],
         capture_output=True,
         check=False,
     )
     if in_history.returncode != 0:
         return (
-            f"commit {entry.commit} is not in the history of HEAD; compute it again, or fetch the "
+            f"commit {entry.checked} is not in the history of HEAD; compute it again, or fetch the "
             "whole history if this is a shallow clone"
         )
 
@@ -147,14 +167,14 @@ def why_stale(root: Path, entry: Entry) -> str:
     if not changed:
         return ""
     more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-    return f"code has changed since {entry.commit}: {changed[0]}{more}"
+    return f"code has changed since {entry.checked}: {changed[0]}{more}"
 
 
 def changed_files(root: Path, entry: Entry) -> list[str]:
     """Return the files of an entry whose code differs between its commit and the working tree."""
-    command = ("diff", "--name-only", "--no-renames", "-z", entry.commit, "--", *entry.code)
+    command = ("diff", "--name-only", "--no-renames", "-z", entry.checked, "--", *entry.code)
     names = git(root, *command).split("\0")
-    return [name for name in names if name and not same_code(root, entry.commit, name)]
+    return [name for name in names if name and not same_code(root, entry.checked, name)]
 
 
 @functools.cache
@@ -186,8 +206,11 @@ def is_text(node: ast.AST) -> bool:
     )
 
 
-def stamp(root: Path, name: str) -> str:
-    """Write the present commit into an entry of the manifest, and return the commit."""
+def stamp(root: Path, name: str, part: str = "") -> str:
+    """Write the present commit into an entry of the manifest, and return the commit.
+
+    If only a `part` was computed again, the entry keeps the commit of its results.
+    """
     entries = {entry.name: entry for entry in read_manifest(root)}
     if name not in entries:
         sys.exit(f"{MANIFEST} has no entry {name!r}; it has {', '.join(entries)}")
@@ -198,8 +221,13 @@ def stamp(root: Path, name: str) -> str:
 
     commit = git(root, "rev-parse", "--short=8", "HEAD").strip()
     before, head, after = (root / MANIFEST).read_text().partition(f"[{name}]\n")
-    after = re.sub(r'^commit = ".*"(?: *#.*)?$', f'commit = "{commit}"', after, count=1, flags=re.M)
-    (root / MANIFEST).write_text(before + head + after)
+    own, rest = re.match(r"(.*?)(^\[.*|\Z)", after, flags=re.S | re.M).groups()
+    own = re.sub(r"^(same|part) = .*\n", "", own, flags=re.M)
+    lines = f'commit = "{commit}"'
+    if part:
+        lines = f'commit = "{entries[name].commit}"\nsame = "{commit}"\npart = {json.dumps(part)}'
+    own = re.sub(r'^commit = ".*"(?: *#.*)?$', lambda _: lines, own, count=1, flags=re.M)
+    (root / MANIFEST).write_text(before + head + own + rest)
     return commit
 
 

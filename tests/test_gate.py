@@ -193,6 +193,25 @@ def test_a_stamp_records_the_present_commit(repository):
     assert list(gate.faults(repository)) == []
 
 
+def test_a_part_that_was_run_again_is_recorded_beside_the_commit(repository):
+    of_results = gate.read_manifest(repository)[0].commit
+    write(repository, "src/model.py", CODE.replace("0.5", "5e-1 + 0.0"))
+    commit(repository)
+    assert "code has changed" in "".join(gate.faults(repository))
+
+    part = 'python src/model.py --method "small"'
+    gate.stamp(repository, "results", part)
+    (entry,) = gate.read_manifest(repository)
+    assert (entry.commit, entry.part) == (of_results, part)
+    assert git(repository, "rev-parse", "HEAD").startswith(entry.same)
+    assert not [*gate.faults(repository)]
+
+    gate.stamp(repository, "results")
+    (entry,) = gate.read_manifest(repository)
+    assert (entry.same, entry.part) == ("", "")
+    assert not [*gate.faults(repository)]
+
+
 def test_a_stamp_of_an_unknown_name_is_refused(repository):
     with pytest.raises(SystemExit, match="tables"):
         gate.stamp(repository, "tables")

@@ -146,7 +146,9 @@ class World:
         """Make a simulator of the true world; posts and routes are from the assumed workspace."""
         terrain = self.true_terrain()
         if self.radio:
-            return RadioSimulator(workspace, terrain=terrain)
+            # The default seed is a hash of the heights, whose last bits depend on the processor.
+            seed = int(drawn(self.ground, "radio").integers(2**31))
+            return RadioSimulator(workspace, terrain=terrain, seed=seed)
 
         given = {"terrain": terrain, "sight": self.sight, "team": self.team}
         return KinematicSimulator(workspace, events=self._events(terrain), **given)

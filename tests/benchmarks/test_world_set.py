@@ -110,6 +110,8 @@ def test_worlds_of_synthetic_terrain_can_be_made(listed):
         small = dataclasses.replace(world, shape=(3, 3), cell=20.0)
         simulator = small.simulator(small.workspace(bounds=False))
         assert isinstance(simulator, RadioSimulator if world.radio else KinematicSimulator)
+        if isinstance(simulator, RadioSimulator):  # not a hash of heights, which are rounded
+            assert simulator.seed == drawn(world.ground, "radio").integers(2**31)
         assert len(getattr(simulator, "events", ())) == len(world.events)
         assert all(isinstance(event, Event) for event in world.events)
         seeds.add(float(small.true_terrain()["dem"].mean()))

@@ -62,7 +62,8 @@ class RadioSimulator(DescribedSimulator):
         Args:
             workspace: A workspace made from a terrain.
             terrain: True DEM and DSM, which must cover the workspace; by default the workspace's.
-            seed: Seed of the field and the radio qualities; by default a hash of the terrain.
+            seed: Seed of the field and the radio qualities; by default a hash of the terrain. The
+                last bits of a synthetic terrain, and so its hash, depend on the processor.
 
         Raises:
             TrustboError: The workspace has no terrain, and no other terrain is given; or the given
