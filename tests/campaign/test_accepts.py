@@ -49,6 +49,12 @@ def states_of(campaign):
     return [campaign.state.status_of(j)[0] for j in range(len(campaign.missions))]
 
 
+def fail(campaign, rng):
+    """Report that the planned path was not completed."""
+    campaign.ask()
+    campaign.fail("stuck")
+
+
 def exclude_one(campaign, rng):
     """Exclude the first mission that the campaign learns from, if there is one."""
     states = states_of(campaign)
@@ -65,7 +71,7 @@ EVENTS = {
     "ended before the unknown cell": lambda campaign, rng: tell(
         campaign, [*AROUND[:2], *ACROSS[1:]], rng, n_run=1, status="aborted"
     ),
-    "failed": lambda campaign, rng: campaign.fail("stuck"),
+    "failed": fail,
     "failed there": lambda campaign, rng: campaign.fail("tipped", where=campaign.ask().path[1]),
     "rain": lambda campaign, rng: campaign.fail("rain"),
     "excluded": exclude_one,

@@ -334,6 +334,7 @@ def test_missions_that_several_results_contain_are_used_once(workspace, first, t
     theirs = tb.Campaign(workspace, *ENDS, earlier=tb.load_result(tmp_path / "first"), **OPTIONS)
     simulator = ModelSimulator(workspace)
     for seed, campaign in enumerate((ours, theirs), start=10):
+        campaign.ask()
         campaign.fail("stuck")
         campaign.tell(simulator.run(campaign.ask().path, seed=seed))
 

@@ -370,6 +370,22 @@ def test_contradictory_reports_of_failures_are_refused(workspace):
     assert not campaign.missions
 
 
+def test_a_failure_without_a_planned_path_is_refused(workspace):
+    campaign = begin(workspace)
+    with pytest.raises(tb.TrustboError, match="Call ask"):
+        campaign.fail("tipped")
+
+    path = campaign.ask().path
+    n_bounds = len(path) - 1
+    rates = np.full((n_bounds, workspace.team.n_robots), 0.8)
+    unknown = np.full((*rates.shape, len(workspace.features)), np.nan)
+    features = workspace.features
+    campaign.tell(tb.Mission.from_arrays(path, unknown, rates, status="stuck", features=features))
+    with pytest.raises(tb.TrustboError, match="already counts"):
+        campaign.fail("stuck")
+    assert not campaign.state.failures
+
+
 def test_causes_are_read_regardless_of_case(workspace):
     campaign = begin(workspace)
     path = campaign.ask().path

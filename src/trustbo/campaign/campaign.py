@@ -386,9 +386,9 @@ class Campaign(Recorder):
             where: Cell that the team failed to enter, if known.
 
         Raises:
-            TrustboError: The reason is empty, the plan does not enter `where`, `where` is given but
-                the reason is not in `hazard.CAUSES`, or the failure cannot be recorded. The failure
-                is then not counted.
+            TrustboError: The reason is empty, a bound failed although no path is planned, the plan
+                does not enter `where`, `where` is given but the reason is not in `hazard.CAUSES`,
+                or the failure cannot be recorded. The failure is then not counted.
         """
         if not isinstance(reason, str) or not reason.strip():
             raise TrustboError(f"reason must be a text such as {CAUSES[0]!r}; got {reason!r}.")
@@ -397,6 +397,12 @@ class Campaign(Recorder):
 
         with self._turn:
             self.storage.require_open()
+            if reason in CAUSES and self.state.asked is None:
+                raise TrustboError(
+                    f"no path is planned on which a bound can have failed ({reason}). Call ask "
+                    "before the mission is run; a mission that was told with this status already "
+                    "counts as a failure."
+                )
             path = self.ask().path if reason in CAUSES or where is not None else ()
             where = None if where is None else require_pair("where", where)
             entered = tuple(cells_of(path[1:]))
