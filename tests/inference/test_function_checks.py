@@ -473,6 +473,23 @@ def test_a_variable_with_a_single_value_is_refused(missions, distribution):
         check(missions, beside(lambda: numpyro.sample("c", distribution)))
 
 
+@pytest.mark.parametrize("noise", ["delta_w", "delta_v"])
+def test_a_noise_that_may_be_negative_is_refused(missions, noise):
+    def model_with(prior):
+        def model(awareness, contact_rate=None):
+            b = numpyro.sample("b", dist.Normal(0.5, 0.3))
+            noises = {"delta_w": 0.05, "delta_v": 0.1, noise: numpyro.sample("noise", prior)}
+            law = ContactRate(b * awareness[..., 0], 0.4, **noises)
+            numpyro.sample("contact_rate", law, obs=contact_rate)
+
+        return model
+
+    for prior in (dist.Normal(0.0, 0.1), dist.Normal(0.0, 0.1).expand([3]).to_event(1)):
+        with pytest.raises(tb.TrustboError, match=f"{noise} of .* 'noise', .* HalfNormal"):
+            check(missions, model_with(prior))
+    check(missions, model_with(dist.HalfNormal(0.1)))
+
+
 def test_a_site_with_obs_mask_is_refused(missions):
     known = jnp.arange(20) < 15
 

@@ -10,6 +10,7 @@ from numpyro.distributions import (
     Independent,
     MaskedDistribution,
     TransformedDistribution,
+    constraints,
 )
 
 from trustbo.display import joined
@@ -18,6 +19,7 @@ from trustbo.inference.functions.data import RATES, Data
 from trustbo.inference.functions.explain import wrong_drift
 from trustbo.inference.functions.sites import has_prior, safe
 from trustbo.models.contact_rate import ContactRate
+from trustbo.models.scores import NOISES
 
 _HOW = (
     'End it with numpyro.sample("contact_rate", tb.models.ContactRate(drift, beta0, delta_w, '
@@ -49,6 +51,22 @@ def require_rates(who: str, trace: Mapping[str, Any], data: Data) -> None:
         raise TrustboError(wrong_drift(who, given, data))
 
     _require_variables(who, trace)
+    _require_positive_noises(who, trace, rates)
+
+
+def _require_positive_noises(who: str, trace: Mapping[str, Any], rates: ContactRate) -> None:
+    """Raise TrustboError for a standard deviation of either sign, which rates cannot tell apart."""
+    for noise, value in zip(NOISES, rates.noises, strict=False):
+        for name, one in trace.items():
+            if one["type"] != "sample" or one["value"] is not value:
+                continue
+
+            support = one["fn"].support
+            if getattr(support, "base_constraint", support) is constraints.real:
+                raise TrustboError(
+                    f"{noise} of {who} is the variable {name!r}, which may be negative; give it a "
+                    "positive distribution, such as HalfNormal or LogNormal."
+                )
 
 
 def _require_no_obs_mask(who: str, trace: Mapping[str, Any]) -> None:
