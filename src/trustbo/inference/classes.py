@@ -153,7 +153,7 @@ def by_importance(
 
         is_last = not attempts
         drawn, log_p, summary = _draws(density, n, size, rng, proposal, is_last)
-        if summary["k_hat"] <= MAX_KHAT or not attempts:
+        if summary["k_hat"] <= MAX_KHAT or is_last:
             return drawn, {"lp": log_p}, summary
 
 
