@@ -473,6 +473,15 @@ def test_a_variable_with_a_single_value_is_refused(missions, distribution):
         check(missions, beside(lambda: numpyro.sample("c", distribution)))
 
 
+def test_a_misspelt_input_with_a_default_is_warned_of():
+    def model(awareness, contact_rate=None, nticks=None, size=3):
+        pass
+
+    with pytest.warns(UserWarning, match="'nticks' .* if the input 'n_ticks'") as caught:
+        as_model(model)
+    assert len(caught) == 1
+
+
 @pytest.mark.parametrize("noise", ["delta_w", "delta_v"])
 def test_a_noise_that_may_be_negative_is_refused(missions, noise):
     def model_with(prior):

@@ -31,6 +31,11 @@ def test_features_are_composites_or_used_unchanged(terrain):
     np.testing.assert_allclose(of_r1, cover, atol=1e-6)
 
 
+def test_the_remedy_for_a_large_feature_says_that_the_index_is_reversed(terrain):
+    with pytest.raises(TrustboError, match=r"\['tri'\]}, which is larger where tri is smaller"):
+        Workspace.from_terrain(terrain, (4, 3), features={"z": "tri"})
+
+
 def test_canopy_of_the_features_is_that_of_the_assumed_sight(terrain):
     def pixels(**sight):
         made = Workspace.from_terrain(terrain, (4, 3), bounds=False, features=features,

@@ -79,9 +79,12 @@ def pixel_maps(
             low = np.nanmin(values, initial=0.0)
             high = np.nanmax(values, initial=1.0)
             if low < 0.0 or high > 1.0:
+                reverses = FEATURES[parts].sign < 0
+                order = f", which is larger where {parts} is smaller" if reverses else ""
                 raise TrustboError(
                     f"feature {name!r} is used unchanged and must be in [0, 1]; its values are "
-                    f"{low:g} to {high:g}. Make it a composite index: {{{name!r}: [{parts!r}]}}."
+                    f"{low:g} to {high:g}. Make it a composite index: {{{name!r}: [{parts!r}]}}"
+                    f"{order}; or scale it in a function with tb.terrain.feature."
                 )
             continue
 

@@ -3,6 +3,7 @@
 import inspect
 import json
 from collections.abc import Callable, Collection, Mapping
+from difflib import get_close_matches
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from numpyro.infer.util import log_density
 from numpyro.primitives import Messenger, sample
 
 from trustbo.display import joined
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, warn
 from trustbo.inference.functions.data import NAMES, RATES, Data, FeatureNames, arrays_of
 from trustbo.inference.functions.explain import explained
 from trustbo.inference.functions.identity import constants_of, fingerprint, name_of
@@ -45,6 +46,8 @@ EFFECTS = "effects on the drift"
 """Name of the sum of the effects among the values of `FunctionModel.evaluate`."""
 KIND = "function"
 """Value of the entry `class` in the record of a model that is a function."""
+_ALIKE = 0.85
+"""Similarity (`difflib`) of a parameter to the name of an input from which a warning is issued."""
 _MOST_TRACED = 16
 """Number of shapes of data whose traces are kept."""
 
@@ -570,4 +573,13 @@ def _inputs_of(function: Callable[..., Any], name: str) -> tuple[str, ...]:
             f"the parameter {unknown[0]!r} of the function {name} is not an input of a model; the "
             f"inputs are {joined(list(NAMES))}. Give it a default, or use functools.partial."
         )
+
+    others = [one for one in NAMES if one not in takes]
+    for parameter in parameters:
+        alike = [] if parameter in takes else get_close_matches(parameter, others, 1, _ALIKE)
+        if alike:
+            warn(
+                f"the parameter {parameter!r} of the function {name} is not an input of a model "
+                f"and keeps its default; rename it if the input {alike[0]!r} is meant."
+            )
     return takes
