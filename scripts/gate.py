@@ -79,8 +79,10 @@ def main() -> None:
 
     found = list(faults(ROOT))
     print("\n".join(found) or "all tables, figures and notebooks are of the present code")
-    if parts := [f"{e.name} ({e.part})" for e in read_manifest(ROOT) if e.same]:
-        print(f"of these, only a part was run again: {', '.join(parts)}")
+    entries = [entry for entry in read_manifest(ROOT) if entry.same]
+    for part in dict.fromkeys(entry.part for entry in entries):
+        names = [entry.name for entry in entries if entry.part == part]
+        print(f"of {', '.join(names)}, only a part was run again: {part}")
     sys.exit(bool(found))
 
 
