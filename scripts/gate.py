@@ -69,12 +69,13 @@ def main() -> None:
     same = commands.add_parser("same", help="record that a part was computed again, and is equal")
     for command in (stamped, same):
         command.add_argument("names", nargs="+", metavar="NAME")
+    stamped.set_defaults(part="")
     same.add_argument("--part", required=True, metavar="COMMAND", help="what was run")
     given = parser.parse_args()
 
     if given.command is not None:
         for name in given.names:
-            print(f"{name}: {stamp(ROOT, name, getattr(given, 'part', ''))}")
+            print(f"{name}: {stamp(ROOT, name, given.part)}")
         return
 
     found = list(faults(ROOT))

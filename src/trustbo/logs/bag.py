@@ -210,7 +210,8 @@ def _require_topics(
         """Return what precedes a missing topic in the bag, or an example."""
         return next((name.removesuffix(topic) for name in there if name.endswith(topic)), other)
 
-    of_robots = [topic for topic in contacts if topic not in there]
+    missing = [topic for topic in (bounds, *contacts) if topic not in there]
+    of_robots = [topic for topic in missing if topic != bounds]
     if bounds in there and len(of_robots) < len(contacts):
         if of_robots:
             warn(
@@ -219,10 +220,8 @@ def _require_topics(
             )
         return
 
-    missing = [*of_robots]
     remedies = []
-    if bounds not in there:
-        missing.insert(0, bounds)
+    if bounds in missing:
         remedies.append(f'prefix="{namespace(_BOUND, "/fleet")}" for {_BOUND}')
     if of_robots:
         space = namespace(of_robots[0], "")

@@ -266,14 +266,15 @@ def _warn_of_intervals(looks: pd.DataFrame, tick: float) -> None:
     fast: dict[str, float] = {}
     for name in np.unique(watchers):
         of_watcher = gaps[watchers == name]
-        apart = interval_of(of_watcher)
+        apart = _interval_of(of_watcher)
         if apart > _LONGER * tick:
             slow[str(name)] = apart
 
         # If every reading is a detection, the second one in a tick changes nothing.
-        misses = (of_watcher > _NEXT * apart).mean() > _OFTEN
+        misses = share_before_missing(of_watcher) > _OFTEN
         if apart < _SHORTER * tick and misses and _is_regular(of_watcher, apart):
             fast[str(name)] = apart
+
     all_gaps = gaps[~np.isnan(gaps)]
     short = all_gaps[all_gaps < 0.5 * tick]
     least = float(np.quantile(all_gaps, _OFTEN)) if all_gaps.size else np.nan
@@ -300,7 +301,12 @@ def _is_regular(gaps: np.ndarray, apart: float) -> bool:
     return float(np.nanquantile(gaps, _OFTEN)) > _REGULAR * apart
 
 
-def interval_of(gaps: np.ndarray) -> float:
+def share_before_missing(gaps: np.ndarray) -> float:
+    """Return the share of times between readings in which others are missing; 0 if unknown."""
+    return float((gaps > _NEXT * _interval_of(gaps)).mean())
+
+
+def _interval_of(gaps: np.ndarray) -> float:
     """Return the interval between readings of a detector; NaN if it is unknown.
 
     Times between detections are multiples of the interval, because some readings detect nothing.

@@ -6,14 +6,12 @@ import numpy as np
 import pandas as pd
 
 from trustbo.errors import TrustboError, warn
-from trustbo.logs.detections import interval_of
+from trustbo.logs.detections import share_before_missing
 
 _LATE = 1_000_000_000
 """Time after a marker in which the status of the bound before may arrive, ns."""
 _SMALL = 0.1
 """Share of the contact messages of a bound that is small."""
-_LATER = 1.5
-"""Time since a robot's last contact message above which messages are missing, in usual times."""
 _MANY_MISSING = 0.1
 """Share of messages after which others are missing from which it is warned of."""
 _ABORTED = "aborted"
@@ -106,13 +104,11 @@ def warn_of_robots(ticks: pd.DataFrame, robots: Sequence[str]) -> None:
             "is unknown; check the clocks of these robots."
         )
 
-    times = ticks.index.to_series()
-    gaps = times.groupby([ticks["robot"].to_numpy(), ticks["row"].to_numpy()]).diff().to_numpy()
-    for robot, of_robot in ticks.assign(gap=gaps).groupby("robot"):
-        apart = of_robot["gap"].to_numpy()
-        is_late = apart > _LATER * interval_of(apart)
+    timed = ticks.assign(time=ticks.index)
+    timed["gap"] = timed.groupby(["robot", "row"])["time"].diff().to_numpy()
+    for robot, of_robot in timed.groupby("robot"):
         always = np.all(of_robot["contact"].to_numpy())
-        if always and is_late.sum() > _MANY_MISSING * len(is_late):
+        if always and share_before_missing(of_robot["gap"].to_numpy()) > _MANY_MISSING:
             warn(
                 f"all contact messages of {robot} say that there is contact, and often some are "
                 "missing; if they are sent only during contact, also send those without contact. "

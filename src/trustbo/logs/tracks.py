@@ -150,14 +150,9 @@ def read_tracks(
 
 def _leads(lead: str | None, robots: Sequence[str], workspace: Workspace | None) -> Sequence[str]:
     """Return the leads of a log: the given one, the robot that is not in the team, or all."""
-    if lead is not None:
-        require_choice("lead", lead, robots)
-    if workspace is None:
-        return robots if lead is None else [lead]
-
-    team = workspace.team.names
+    team = () if workspace is None else workspace.team.names
     others = [name for name in robots if name not in team]
-    leads = others if lead is None else [lead]
+    leads = others if lead is None else [require_choice("lead", lead, robots)]
     absent = [name for name in team if name not in robots]
     if absent and (len(others) > 1 or len(absent) == len(team)):
         raise TrustboError(
@@ -169,7 +164,7 @@ def _leads(lead: str | None, robots: Sequence[str], workspace: Workspace | None)
             f"there are no poses of {', '.join(absent)} of the team, so their contact in this "
             "mission is unknown; add the poses if they took part."
         )
-    if len(leads) != 1:
+    if workspace is not None and len(leads) != 1:
         raise TrustboError(f"a log with a map has one lead; pass lead=, one of {others or robots}.")
     return leads
 
