@@ -1,5 +1,6 @@
 """The checks of tracked files and the gate fail on planted faults, and pass a clean repository."""
 
+import re
 import subprocess
 
 import check_files
@@ -259,3 +260,12 @@ def test_lines_differ_if_a_number_does_by_more_than_rounding(before, after, diff
 def test_numbers_of_a_text_that_no_output_shows_are_found(text, found):
     unshown = compare_notebooks.unshown(small(text=text))
     assert [number for number, _ in unshown] == found
+
+
+def test_claims_of_the_readme_name_the_commits_of_their_entries():
+    page = (gate.ROOT / "docs" / "benchmarks.md").read_text()
+    claims = page.partition("## Claims of README\n")[2]
+    named = re.findall(r"\| `([\w-]+)`, ([0-9a-f]{8}) \|\n", claims)
+    commits = {entry.name: entry.commit for entry in gate.read_manifest(gate.ROOT)}
+    assert len(named) > 5
+    assert named == [(name, commits[name]) for name, _ in named]
