@@ -386,10 +386,44 @@ def test_a_failure_without_a_planned_path_is_refused(workspace):
     assert not campaign.state.failures
 
 
+def test_a_withdrawn_failure_changes_the_table_alone(workspace, tmp_path):
+    campaign = begin(workspace, directory=tmp_path / "c")
+    plan = campaign.ask()
+    without = campaign.risk.along(plan.path).p_arrive
+
+    campaign.fail("stuck", where=plan.path[1])
+    campaign.fail("tipped", where=campaign.ask().path[1])
+    with_both = campaign.risk.along(plan.path).p_arrive
+    assert with_both < without
+
+    campaign.withdraw(1, "wrong team")
+    assert campaign.state.asked is None
+    assert campaign.hazard["failures"].values.sum() == 1
+    assert with_both < campaign.risk.along(plan.path).p_arrive < without
+    table = campaign.table()
+    assert table["state"].tolist() == ["excluded", "given up"]
+    assert table["reason"].tolist() == ["wrong team", "tipped"]
+    assert table["status"].tolist() == ["stuck", "tipped"]
+
+    campaign.close()
+    with tb.Campaign.load(tmp_path / "c") as again:
+        assert again.state.failures == campaign.state.failures
+        again.withdraw(2, "as well")
+        assert not again.risk.has_failures
+        assert again.risk.along(plan.path).p_arrive == pytest.approx(without, abs=0.002)
+        wrong = (1, "twice", "wrong team"), (3, "none", "there are 2"), (0, "none", "n")
+        for n, reason, named in wrong:
+            with pytest.raises(tb.TrustboError, match=named):
+                again.withdraw(n, reason)
+
+
 def test_causes_are_read_regardless_of_case(workspace):
     campaign = begin(workspace)
     path = campaign.ask().path
     campaign.fail(" Stuck")
     assert campaign.state.lost == [LostMission(path)]
-    campaign.fail("The lead was Stuck in my office")
+    with pytest.warns(UserWarning, match="does not count as a failed bound.*'stuck'"):
+        campaign.fail("The lead was Stuck in my office")
+    with pytest.warns(UserWarning, match="'lost_contact'"):
+        campaign.fail("Lost contact")
     assert campaign.state.lost == [LostMission(path)]

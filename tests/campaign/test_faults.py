@@ -113,16 +113,26 @@ def template(workspace, tmp_path_factory):
     return folder
 
 
+OPERATIONS = "tell", "fail", "exclude", "withdraw", "suggest", "replan", "ask"
+
+
 def operations(campaign, mission):
     def ask():
         if not campaign.state.failures:
             campaign.fail("rain")
         return campaign.ask()
 
+    def withdraw():
+        if not campaign.state.failures:
+            campaign.fail("stuck")
+        if not campaign.state.failures[0].withdrawn:
+            campaign.withdraw(1, "wrong team")
+
     return {
         "tell": lambda: campaign.tell(mission),
         "fail": lambda: campaign.fail("stuck", where=campaign.ask().path[1]),
         "exclude": lambda: campaign.exclude(1, "the lidar was covered"),
+        "withdraw": withdraw,
         "suggest": lambda: campaign.suggest(OTHER),
         "replan": lambda: campaign.replan((2, 0), blocked=[campaign.ask().path[:2]]),
         "ask": ask,
@@ -133,7 +143,8 @@ def summary(campaign):
     state = campaign.state
     asked = None if state.asked is None else state.asked.path
     counted = tuple(entry.why_excluded is not None for entry in state.entries)
-    return counted, len(state.failures), asked
+    failures = tuple(bool(failure.withdrawn) for failure in state.failures)
+    return counted, failures, asked
 
 
 def attempt(operation):
@@ -169,8 +180,8 @@ def check(folder, operate, mission, expected, fault):
         with fault:
             outcome = attempt(operations(campaign, mission)[operate])
         after = summary(campaign)
-        if operate == "ask" and outcome != "done":
-            before = after  # it consists of two operations, of which one may be done
+        if operate in ("ask", "withdraw") and outcome != "done":
+            before = after  # they consist of two operations, of which one may be done
         assert after == before or outcome != "refused"
         assert reopened(folder, copy)[:2] == after[:2]
         if outcome == "done":
@@ -204,7 +215,7 @@ def expected(template, mission, tmp_path_factory):
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("operate", ["tell", "fail", "exclude", "suggest", "replan", "ask"])
+@pytest.mark.parametrize("operate", OPERATIONS)
 @pytest.mark.slow
 def test_operation_that_fails_at_any_call_is_recorded_or_not(
     template, mission, expected, tmp_path, operate, fault
@@ -297,7 +308,7 @@ def full(disk, n_bytes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("operate", ["tell", "fail", "exclude", "suggest", "replan", "ask"])
+@pytest.mark.parametrize("operate", OPERATIONS)
 def test_operation_on_a_full_disk_is_recorded_or_not(
     template, mission, expected, small_disk, operate
 ):

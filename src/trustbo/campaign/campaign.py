@@ -23,7 +23,7 @@ from trustbo.campaign.settings import (
     to_settings,
 )
 from trustbo.campaign.simulated import require_simulator, run_missions, settings_of
-from trustbo.campaign.state import Entry, Exclusion, Failure, State
+from trustbo.campaign.state import Entry, Failure, State
 from trustbo.campaign.stopping import Stop, require_stop
 from trustbo.data import Cell, Mission, cells_of
 from trustbo.display import say
@@ -340,49 +340,16 @@ class Campaign(Recorder):
             self._learn_and_write(recorded)
             return self.state.posterior
 
-    def exclude(self, n: int, reason: str) -> xr.DataTree | None:
-        """Exclude a mission from learning; to use it again, pass the mission to `tell`.
-
-        Args:
-            n: Number of the mission, from 1.
-            reason: Reason to store in the table of missions.
-
-        Returns:
-            Posterior of the parameters given the other missions; None if there are none. If it
-            cannot be computed, a warning is issued, and the previous posterior is returned.
-
-        Raises:
-            TrustboError: There is no such mission, it is already excluded by a user, or the
-                exclusion cannot be recorded. The mission is then not excluded.
-        """
-        with self._turn:
-            self.storage.require_open()
-            entries = self.state.entries
-            if require_whole("n", n, 1) > len(entries):
-                raise TrustboError(
-                    f"there is no mission {n} to exclude; the last is mission {len(entries)}."
-                )
-            before = entries[n - 1].exclusion
-            if before is not None:
-                raise TrustboError(f"mission {n} is already excluded: {before.reason}")
-
-            self._learn()
-            entries = list(self.state.entries)
-            exclusion = Exclusion(len(entries), str(reason))
-            entries[n - 1] = replace(entries[n - 1], exclusion=exclusion)
-            self._record(entries=tuple(entries), asked=None)
-            self._learn_and_write(f"the exclusion of mission {n} is recorded")
-            return self.state.posterior
-
     def fail(self, reason: str, *, where: Cell | None = None) -> None:
         """Report that no bound of the planned mission was measured; `ask` then plans again.
 
-        If bounds were run, `tell` a mission with these bounds and its status instead.
+        If bounds were run, `tell` a mission with these bounds and its status instead. `withdraw`
+        takes a report back.
 
         Args:
             reason: Reason to store in the table of missions. Reasons in `hazard.CAUSES`, such as
                 "stuck", mean that a bound of the plan failed, and only these are used to learn the
-                hazard.
+                hazard. If another reason contains one of them, a warning is issued.
             where: Cell that the team failed to enter, if known.
 
         Raises:
@@ -415,6 +382,13 @@ class Campaign(Recorder):
             self._learn()
             failure = Failure(len(self.state.entries), reason, tuple(path), where)
             self._record(failures=(*self.state.failures, failure), asked=None)
+
+        named = [cause for cause in CAUSES if cause in reason.lower().replace(" ", "_")]
+        if named and reason not in CAUSES:
+            warn(
+                f"the reason {reason!r} does not count as a failed bound. If a bound failed, "
+                f"report {named[0]!r} after the next ask."
+            )
 
     def run(
         self,

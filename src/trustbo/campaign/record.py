@@ -130,9 +130,10 @@ def state_from_record(
         complete.append(replace(entry, exclusion=exclusion, posterior=posteriors[name]))
 
     failures = []
-    for after, reason, path, where in record["failures"]:
+    for after, reason, path, where, withdrawn in record["failures"]:
         cells = tuple(map(tuple, path))
-        failures.append(Failure(after, reason, cells, None if where is None else tuple(where)))
+        cell = None if where is None else tuple(where)
+        failures.append(Failure(after, reason, cells, cell, withdrawn))
 
     asked = record["asked"]
     fitted = record["fitted"]

@@ -3,11 +3,13 @@
 from dataclasses import replace
 from typing import Any, Self
 
+import xarray as xr
+
 from trustbo.campaign.folder import FolderStorage, MemoryStorage
 from trustbo.campaign.learning import with_posterior
 from trustbo.campaign.result import Result
-from trustbo.campaign.state import State
-from trustbo.errors import TrustboError, warn
+from trustbo.campaign.state import Exclusion, State
+from trustbo.errors import TrustboError, require_whole, warn
 from trustbo.files import FilePath, holding_interrupts
 from trustbo.inference.learner import Learner
 from trustbo.planning import Planner
@@ -100,6 +102,68 @@ class Recorder(Result):
         except BaseException as error:
             error.add_note(f"{what}; it will be learned at the next call.")
             raise
+
+    def exclude(self, n: int, reason: str) -> xr.DataTree | None:
+        """Exclude a mission from learning; to use it again, pass the mission to `tell`.
+
+        Args:
+            n: Number of the mission, from 1.
+            reason: Reason to store in the table of missions.
+
+        Returns:
+            Posterior of the parameters given the other missions; None if there are none. If it
+            cannot be computed, a warning is issued, and the previous posterior is returned.
+
+        Raises:
+            TrustboError: There is no such mission, it is already excluded by a user, or the
+                exclusion cannot be recorded. The mission is then not excluded.
+        """
+        with self._turn:
+            self.storage.require_open()
+            entries = self.state.entries
+            if require_whole("n", n, 1) > len(entries):
+                raise TrustboError(
+                    f"there is no mission {n} to exclude; the last is mission {len(entries)}."
+                )
+            before = entries[n - 1].exclusion
+            if before is not None:
+                raise TrustboError(f"mission {n} is already excluded: {before.reason}")
+
+            self._learn()
+            entries = list(self.state.entries)
+            exclusion = Exclusion(len(entries), str(reason))
+            entries[n - 1] = replace(entries[n - 1], exclusion=exclusion)
+            self._record(entries=tuple(entries), asked=None)
+            self._learn_and_write(f"the exclusion of mission {n} is recorded")
+            return self.state.posterior
+
+    def withdraw(self, n: int, reason: str) -> None:
+        """Withdraw a report of `Campaign.fail` that was a mistake; `ask` then plans again.
+
+        Args:
+            n: Number of the report, from 1: of the rows of `table` without a number, the n-th.
+            reason: Reason to store in the table of missions.
+
+        Raises:
+            TrustboError: There is no such report, it is already withdrawn, the reason is empty, or
+                the withdrawal cannot be recorded. The report then still counts.
+        """
+        with self._turn:
+            self.storage.require_open()
+            failures = list(self.state.failures)
+            if require_whole("n", n, 1) > len(failures):
+                raise TrustboError(
+                    f"there is no report {n} of `fail` to withdraw; there are {len(failures)}."
+                )
+            if not str(reason).strip():
+                raise TrustboError(f"reason must not be empty; got {reason!r}.")
+            before = failures[n - 1].withdrawn
+            if before:
+                raise TrustboError(f"report {n} of `fail` is already withdrawn: {before}")
+
+            self._learn()
+            failures[n - 1] = failures[n - 1]._replace(withdrawn=str(reason))
+            self._record(failures=tuple(failures), asked=None)
 
     def close(self) -> None:
         """Release the folder, so that others can use it; a campaign in memory can go on.

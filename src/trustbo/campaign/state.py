@@ -35,25 +35,28 @@ class Failure(NamedTuple):
         reason: Reason, one of `hazard.CAUSES` if a bound failed.
         path: Planned path, start first; empty if no bound caused the failure.
         where: Cell that the team failed to enter, if known.
+        withdrawn: Reason why a user has withdrawn the report, or an empty string.
     """
 
     after: int
     reason: str
     path: tuple[Cell, ...] = ()
     where: Cell | None = None
+    withdrawn: str = ""
 
     @property
     def lost(self) -> LostMission | None:
-        """The mission for the hazard; None if no bound caused the failure."""
-        return LostMission(self.path, self.where) if self.path else None
+        """The mission for the hazard; None if no bound failed or the report is withdrawn."""
+        is_used = self.path and not self.withdrawn
+        return LostMission(self.path, self.where) if is_used else None
 
     def row(self) -> dict[str, Any]:
         """Return the failure's row in the table of missions."""
         where = "" if self.where is None else path_text([self.where])
         return {
             "status": self.reason if self.path else "aborted",
-            "state": GIVEN_UP,
-            "reason": self.reason,
+            "state": EXCLUDED if self.withdrawn else GIVEN_UP,
+            "reason": self.withdrawn or self.reason,
             "where": where,
             "failed_bounds": where and f"into {where} ({self.reason})",
             "n_bounds": np.nan if self.where is None else cells_of(self.path).index(self.where, 1),
@@ -304,7 +307,7 @@ class State:
             entropy.append(len(self.entries) - len(self.used))
 
         n_failures = sum(failure.after == n for failure in self.failures)
-        if n_failures:
+        if n_failures:  # also those withdrawn
             entropy.append(n_failures)  # after `fail`, a random policy may choose another path
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
