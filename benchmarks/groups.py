@@ -305,7 +305,7 @@ def interval(row: object, places: int) -> str:
 if __name__ == "__main__":
     parser = arguments(__doc__ or "")
     parser.add_argument("file", nargs="?", type=Path, default=STORED, metavar="FILE",
-                        help="table of rows, by default that of version 0.5")  # fmt: skip
+                        help="table of rows, by default worlds_0.6.csv")  # fmt: skip
     given = parsed(parser)
     if not given.file.exists():
         parser.error(f"there is no file {given.file}")
