@@ -462,7 +462,9 @@ def _invert(
 
         for k in range(w - 1, -1, -1):
             a = row[first[s] + k]
-            T[k, :m] = Z[a + w : a + r]
+            for j in range(m):
+                for p in range(n_points):
+                    T[k, j, p] = Z[a + w + j, p]
             V[k, :w] = 0.0
             V[k, k] = 1.0
             for i in range(k + 1, w):

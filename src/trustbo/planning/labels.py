@@ -22,14 +22,16 @@ from trustbo.parallel import over_rows
 from trustbo.planning.limits import (
     Costs,
     Known,
+    copy,
     failing,
     is_beyond,
     least_costs,
     limits_of,
     lost_on,
+    plus,
 )
 from trustbo.planning.sums import costs_of_sums
-from trustbo.planning.unrolled import Unrolled, kernel
+from trustbo.planning.unrolled import Unrolled, kernel, part
 
 MAX_LABELS = 300_000
 """Maximum number of labels. A search that needs more stops with the best path found so far and a
@@ -66,10 +68,10 @@ def best_labels(
     lower = np.empty((len(searches), n))
     paths = np.full((len(searches), n, graph.longest + 1), -1, np.int32)
 
-    for k, part in enumerate(searches):
+    for k, searched in enumerate(searches):
 
-        def work(begin: int, end: int, k: int = k, part: Unrolled = part) -> None:
-            _best_labels(part, costs, max_labels, cost[k], lower[k], paths[k], begin, end)
+        def work(begin: int, end: int, k: int = k, searched: Unrolled = searched) -> None:
+            _best_labels(searched, costs, max_labels, cost[k], lower[k], paths[k], begin, end)
 
         over_rows(work, n)
         cost[k] = cost[k] / divisor[k]
@@ -90,7 +92,7 @@ def _best_labels(graph, costs, max_labels, cost, lower, paths, begin, end):
         cost[d], lower[d] = _best_path(graph, one, max_labels, paths[d])
 
 
-@kernel
+@part
 def _best_path(graph, costs, max_labels, path):
     """Write the cheapest path within the limit, and return its cost (or inf) and a lower limit."""
     n = len(path)
@@ -131,7 +133,7 @@ class Labels(NamedTuple):
     last: np.ndarray
 
 
-@kernel
+@part
 def _search(graph, costs, max_labels, edge_cost, limits, known):
     """Search for the best path; return its cost, or a lower limit if there are too many labels."""
     if len(graph.starts) > max_labels:
@@ -151,7 +153,7 @@ def _search(graph, costs, max_labels, edge_cost, limits, known):
         labels.last[s] = n
         labels.number[n] = 0.0
         labels.number[n, 0] = costs.start[graph.n_bounds_left[s]]
-        labels.number[n, 1 + len(costs.failure) :] = costs.x0
+        copy(costs.x0, labels.number[n, 1 + len(costs.failure) :])
         n += 1
 
     # Edges lead to states of lower index. All labels of a state are therefore known when the state
@@ -168,7 +170,7 @@ def _search(graph, costs, max_labels, edge_cost, limits, known):
     return known.cost[0]
 
 
-@kernel
+@part
 def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
     """Add the successors of a label that may be optimal, and return the new number of labels."""
     n_sums = len(costs.failure)
@@ -183,13 +185,14 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
 
         lost = lost_on(graph, costs, e, number[1 + n_sums :], after)
         cost = number[0] + (edge_cost[e] + lost)
-        sums[:] = number[1 : 1 + n_sums] + costs.risk[e]
+        for m in range(n_sums):
+            sums[m] = number[1 + m] + costs.risk[e, m]
         if _is_hopeless(costs, limits, h, cost, sums, known.cost[0]):
             continue
 
         labels.number[n, 0] = cost
-        labels.number[n, 1 : 1 + n_sums] = sums
-        labels.number[n, 1 + n_sums :] = after
+        copy(sums, labels.number[n, 1 : 1 + n_sums])
+        copy(after, labels.number[n, 1 + n_sums :])
         labels.edge[n] = e
         labels.came_from[n] = graph.cell[s]
         labels.parent[n] = label
@@ -204,10 +207,10 @@ def _extend(graph, costs, edge_cost, limits, known, labels, s, label, n):
     return n
 
 
-@kernel
+@part
 def _is_hopeless(costs, limits, h, cost, sums, known):
     """Check whether no path that enters state h with this cost and these sums can be optimal."""
-    smallest = sums + limits.safest[h]
+    smallest = plus(sums, 1.0, limits.safest[h])
     if is_beyond(costs, smallest):
         return True
 
@@ -222,7 +225,7 @@ def _is_hopeless(costs, limits, h, cost, sums, known):
     return cost + limits.free[h] + failing(costs.failure, smallest) >= known
 
 
-@kernel
+@part
 def _write_edges(graph, labels, label, edges):
     """Write the edges of the path that leads to a label, padded with -1, to `edges`."""
     n = label
@@ -238,7 +241,7 @@ def _write_edges(graph, labels, label, edges):
         label = labels.parent[label]
 
 
-@kernel
+@part
 def _is_dominated(graph, labels, label, other, n_sums):
     """Check whether other labels of the same state make a label unnecessary."""
     number = labels.number[label]

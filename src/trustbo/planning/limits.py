@@ -8,6 +8,8 @@ The cost of a path is bounded from below by a sum over edges. The sum uses the l
 trust, and the chord of F_m (1 - exp(-r_m)) over the sums that can still be optimal. For the limit,
 w_m (1 - exp(-r_m)) is also replaced by its chord. The limit is then relaxed with a Lagrange
 multiplier, which is found by bisection (Handler and Zang 1980).
+
+The kernels loop over elements. Numba takes half a minute longer to compile operations on arrays.
 """
 
 import math
@@ -15,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trustbo.planning.unrolled import edges_from, fill_to_go, kernel, new_to_go
+from trustbo.planning.unrolled import edges_from, fill_to_go, new_to_go, part
 
 LOGISTIC = 0
 """Loss of a bound 1 - sigma(trust)."""
@@ -57,7 +59,7 @@ class Costs(NamedTuple):
     limit: float
 
 
-@kernel
+@part
 def _lost(loss, x, sd):
     """Compute the expected contact lost in a bound after which trust is x."""
     if loss == LOGISTIC:
@@ -73,7 +75,7 @@ def _lost(loss, x, sd):
     return 1.0 - (x * (1.0 - below - above) + sd * density + above)
 
 
-@kernel
+@part
 def lost_on(graph, costs, e, x, after) -> float:
     """Compute the contact lost on edge e, entered with trust x; write the new trust to `after`."""
     n = len(costs.x0)
@@ -89,7 +91,7 @@ def lost_on(graph, costs, e, x, after) -> float:
     return _lost(costs.loss, mean, costs.sd)
 
 
-@kernel
+@part
 def least_costs(graph, costs, edge_cost) -> np.ndarray:
     """Compute the cost (edge,) of each edge, entered with the largest possible trust."""
     if len(costs.x0) == 0:
@@ -99,7 +101,8 @@ def least_costs(graph, costs, edge_cost) -> np.ndarray:
     highest = np.full((len(graph.cell), len(costs.x0)), -np.inf)  # largest trust in each state
     after = np.empty(len(costs.x0))
     for s in graph.starts:
-        highest[s] = costs.x0
+        for i in range(len(after)):
+            highest[s, i] = costs.x0[i]
 
     # The order of states is topological, so the largest trust in a state is final when it is read.
     for s in range(len(graph.cell) - 1, 0, -1):
@@ -107,12 +110,14 @@ def least_costs(graph, costs, edge_cost) -> np.ndarray:
             continue
         for e in range(graph.first[s], graph.first[s + 1]):
             cost[e] = edge_cost[e] + lost_on(graph, costs, e, highest[s], after)
-            highest[graph.head[e]] = np.maximum(highest[graph.head[e]], after)
+            ahead = highest[graph.head[e]]
+            for i in range(len(after)):
+                ahead[i] = max(ahead[i], after[i])
 
     return cost
 
 
-@kernel
+@part
 def failing(weights, r) -> float:
     """Compute sum_m weights_m (1 - exp(-r_m)) for the sums r of the risks, shape (sum,).
 
@@ -125,7 +130,23 @@ def failing(weights, r) -> float:
     return total
 
 
-@kernel
+@part
+def plus(a, factor, b) -> np.ndarray:
+    """Return a + factor * b for arrays (sum,)."""
+    total = np.empty(len(a))
+    for m in range(len(a)):
+        total[m] = a[m] + factor * b[m]
+    return total
+
+
+@part
+def copy(values, out) -> None:
+    """Copy an array to the beginning of another one."""
+    for k in range(len(values)):
+        out[k] = values[k]
+
+
+@part
 def is_beyond(costs, r) -> bool:
     """Check whether the failure probability for the sums r exceeds the limit."""
     return costs.limit < np.inf and failing(costs.share, r) > costs.limit
@@ -145,7 +166,7 @@ class Known(NamedTuple):
     sums: np.ndarray
 
 
-@kernel
+@part
 def _try_paths(graph, costs, edge_cost, to_go, known):
     """Evaluate the cheapest path from each start according to `to_go`, and return the least cost.
 
@@ -164,25 +185,26 @@ def _try_paths(graph, costs, edge_cost, to_go, known):
 
         n = edges_from(graph, to_go, s, known.trial)
         sums[:] = 0.0
-        x[:] = costs.x0
+        copy(costs.x0, x)
         for e in known.trial[:n]:
             cost += edge_cost[e] + lost_on(graph, costs, e, x, after)
-            x[:] = after
-            sums += costs.risk[e]
+            copy(after, x)
+            for m in range(len(sums)):
+                sums[m] += costs.risk[e, m]
         cost += failing(costs.failure, sums)
 
         if cost < known.cost[0] and not is_beyond(costs, sums):
             known.cost[0] = cost
             known.edges[:] = -1
-            known.edges[:n] = known.trial[:n]
+            copy(known.trial[:n], known.edges)
         if value < least:
             least = value
-            known.sums[:] = sums
+            copy(sums, known.sums)
 
     return least
 
 
-@kernel
+@part
 def _fill_priced(graph, costs, least_cost, price, to_go):
     """Fill `to_go` for edge costs that include the risks multiplied by their prices (sum,)."""
     cost = least_cost.copy()
@@ -210,7 +232,7 @@ class Limits(NamedTuple):
     offset: float
 
 
-@kernel
+@part
 def limits_of(graph, costs, edge_cost, least_cost, known) -> Limits:
     """Find good paths and lower limits; no search is needed if the best path attains `lower`."""
     n_sums = len(costs.failure)
@@ -220,9 +242,13 @@ def limits_of(graph, costs, edge_cost, least_cost, known) -> Limits:
 
     nothing = np.zeros(len(graph.head))
     for m in range(n_sums):
-        _fill_priced(graph, costs, nothing, np.eye(n_sums)[m], to_go)
-        safest[:, m] = to_go.least
-        low[m] = to_go.least[graph.starts].min()
+        only = np.zeros(n_sums)
+        only[m] = 1.0
+        _fill_priced(graph, costs, nothing, only, to_go)
+        copy(to_go.least, safest[:, m])
+        low[m] = np.inf
+        for s in graph.starts:
+            low[m] = min(low[m], to_go.least[s])
 
     if is_beyond(costs, low):  # even a path with the smallest value of each sum
         unknown = np.full(len(graph.cell), np.inf)
@@ -239,13 +265,17 @@ def limits_of(graph, costs, edge_cost, least_cost, known) -> Limits:
     # With chords as prices, a sum over edges is a lower bound on the cost (see the module
     # docstring).
     gap = known.cost[0] - least
-    high = np.minimum(_highest(costs.failure, low, gap), _highest(costs.share, low, costs.limit))
+    high = _highest(costs.failure, low, gap)
+    within = _highest(costs.share, low, costs.limit)
+    for m in range(n_sums):
+        high[m] = min(high[m], within[m])
+
     chord, offset = _chords(costs.failure, low, high)
     slope, at_zero = _chords(costs.share, low, high)
 
     relaxed = Relaxed(chord, offset, slope, at_zero)
     lower, extra = _price_of_limit(graph, costs, edge_cost, least_cost, relaxed, to_go, known)
-    price = chord + extra * slope
+    price = plus(chord, extra, slope)
     _fill_priced(graph, costs, least_cost, price, to_go)
     if extra > 0.0:  # otherwise, the limit may be inf, and 0 times inf is NaN
         offset += extra * (at_zero - costs.limit)
@@ -253,7 +283,7 @@ def limits_of(graph, costs, edge_cost, least_cost, known) -> Limits:
     return Limits(lower, safest, free, to_go.least, price, offset)
 
 
-@kernel
+@part
 def _follow_tangents(graph, costs, edge_cost, least_cost, weights, sums, to_go, known):
     """Try the cheapest paths for tangents to the concave sum_m weights_m (1 - exp(-r_m)).
 
@@ -261,16 +291,21 @@ def _follow_tangents(graph, costs, edge_cost, least_cost, weights, sums, to_go, 
     """
     price = np.zeros(len(weights))
     for _ in range(_N_TANGENTS):
-        before = price
-        price = weights * np.exp(-sums)
-        if np.abs(price - before).max() <= _PRICE_TOLERANCE * weights.max():
+        change = 0.0
+        largest = 0.0
+        for m in range(len(weights)):
+            before = price[m]
+            price[m] = weights[m] * math.exp(-sums[m])
+            change = max(change, abs(price[m] - before))
+            largest = max(largest, weights[m])
+        if change <= _PRICE_TOLERANCE * largest:
             break
         _fill_priced(graph, costs, least_cost, price, to_go)
         _try_paths(graph, costs, edge_cost, to_go, known)
         sums = known.sums
 
 
-@kernel
+@part
 def _highest(weights, low, most):
     """Return the largest value (sum,) of each sum for which the failure is at most `most`.
 
@@ -287,7 +322,7 @@ def _highest(weights, low, most):
     return high
 
 
-@kernel
+@part
 def _chords(weights, low, high):
     """Find the slopes (sum,) and the constant of a plane below sum_m weights_m (1 - exp(-r_m)).
 
@@ -320,7 +355,7 @@ class Relaxed(NamedTuple):
     at_zero: float
 
 
-@kernel
+@part
 def _price_of_limit(graph, costs, edge_cost, least_cost, relaxed, to_go, known):
     """Find the price of the limit that maximises the lower limit on the cost of all paths.
 
@@ -334,7 +369,7 @@ def _price_of_limit(graph, costs, edge_cost, least_cost, relaxed, to_go, known):
     over = np.inf
 
     for _ in range(_N_PRICES):
-        price = relaxed.chord + extra * relaxed.slope
+        price = plus(relaxed.chord, extra, relaxed.slope)
         _fill_priced(graph, costs, least_cost, price, to_go)
         dual = relaxed.offset + _try_paths(graph, costs, edge_cost, to_go, known)
         if extra > 0.0:  # otherwise, the limit may be inf, and 0 times inf is NaN

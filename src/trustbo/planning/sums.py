@@ -9,7 +9,7 @@ import numpy as np
 
 from trustbo.parallel import over_rows
 from trustbo.planning.objectives import Weights
-from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, new_to_go
+from trustbo.planning.unrolled import Unrolled, edges_from, fill_to_go, kernel, new_to_go, part
 
 
 def best_sums(
@@ -64,7 +64,7 @@ def _best_sums(graph, drift, per_bound, constant, scale, bound_cost, scores, pat
             paths[d, n] = graph.cell[0]
 
 
-@kernel
+@part
 def costs_of_sums(graph, drift, per_bound, bound_cost, cost) -> None:
     """Write the cost of each edge for one draw to `cost`: that of its bound minus w_j . u."""
     for e in range(len(graph.head)):

@@ -15,6 +15,8 @@ from trustbo.workspace.moves import END
 
 kernel = kernels.kernel()
 """Numba decorator of the kernels of the search."""
+part = kernels.part()
+"""Numba decorator of what only these kernels call."""
 
 
 class Unrolled(NamedTuple):
@@ -121,7 +123,7 @@ class ToGo(NamedTuple):
     other: np.ndarray
 
 
-@kernel
+@part
 def new_to_go(n_states: int) -> ToGo:
     """Allocate arrays for the costs from `n_states` states to the goal."""
     edge = np.full(n_states, -1)
@@ -129,7 +131,7 @@ def new_to_go(n_states: int) -> ToGo:
     return ToGo(np.zeros(n_states), edge, np.full(n_states, np.inf), other)
 
 
-@kernel
+@part
 def fill_to_go(graph, cost, to_go) -> None:
     """Fill `to_go` for the edge costs (edge,) by dynamic programming, starting at the goal."""
     least, edge, second, other = to_go
@@ -166,7 +168,7 @@ def fill_to_go(graph, cost, to_go) -> None:
         other[s] = at_next
 
 
-@kernel
+@part
 def edges_from(graph, to_go, start, edges) -> int:
     """Write the edges of the cheapest path from a state to `edges`, and return their number."""
     s = start

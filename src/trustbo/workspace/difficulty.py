@@ -250,7 +250,7 @@ def _of_routes(pace, rasters, place, driving, windows, starts, goals, exists):
     for b in range(len(exists)):
         top, bottom, left, right = windows[b]
         within = pace[top:bottom, left:right].copy()
-        nexts = np.flatnonzero(exists[b])
+        nexts = [n for n in range(exists.shape[1]) if exists[b, n]]
         ends = np.empty((len(nexts), 2), np.int64)
         for k in range(len(nexts)):
             ends[k, 0] = to_pixel[b, nexts[k], 0] - top
@@ -259,7 +259,8 @@ def _of_routes(pace, rasters, place, driving, windows, starts, goals, exists):
         for s in range(start.shape[1]):
             same = _first(start[b], s)  # sets of posts and next ways share many routes
             if same < s:
-                measured[b, s] = measured[b, same]
+                for n in nexts:
+                    _copy(measured[b, same, n], measured[b, s, n])
                 continue
 
             begin = from_pixel[b, s, 0] - top, from_pixel[b, s, 1] - left
@@ -268,7 +269,7 @@ def _of_routes(pace, rasters, place, driving, windows, starts, goals, exists):
                 n = nexts[k]
                 same = _first(goal[b], n)
                 if same < n:
-                    measured[b, s, n] = measured[b, s, same]
+                    _copy(measured[b, s, same], measured[b, s, n])
                     continue
 
                 way = same_way(within, pixel, best, came, begin, (ends[k, 0], ends[k, 1]))
@@ -285,6 +286,13 @@ def _first(positions, k):
         if positions[i, 0] == positions[k, 0] and positions[i, 1] == positions[k, 1]:
             return i
     return k
+
+
+@_part
+def _copy(values, out):
+    """Copy the measures of a route; numba compiles an assignment of slices for three seconds."""
+    for i in range(len(out)):
+        out[i] = values[i]
 
 
 @_part

@@ -173,7 +173,10 @@ def search(pace, pixel, start, goals, slack):
     rows, cols = pace.shape
     best = np.full((rows, cols), np.inf)
     came = np.full((rows, cols), -1)
-    least = pace.min()
+    least = np.inf
+    for r in range(rows):
+        for c in range(cols):
+            least = min(least, pace[r, c])
     diagonal = math.hypot(pixel[0], pixel[1])
 
     is_goal = np.zeros((rows, cols), np.bool_)
