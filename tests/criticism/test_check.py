@@ -1,12 +1,14 @@
 """Check of a fitted model: planted faults stand out, and nothing does without one."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+import xarray as xr
 
 import trustbo as tb
 from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, RobotEffect
@@ -159,6 +161,34 @@ def test_intervals_of_a_campaign_that_are_too_narrow_stand_out():
     assert tb.check(posteriors, noisy).table.loc["coverage", "stands_out"]
 
 
+def test_intervals_that_are_too_narrow_only_in_new_bounds_stand_out():
+    """Rates are as predicted in bounds that were driven before, and noisy in the others."""
+    rng = np.random.default_rng(1)
+    n_repeated, missions, expected = 6, [], []
+    for j, mission in enumerate(drawn(n_missions=6)):
+        start = [(0, k) for k in range(1 + n_repeated)]
+        new = [(1 + j, k) for k in range(len(mission.path) - len(start))]
+        rates = mission.contact_rate.copy()
+        rates[n_repeated:] = rng.uniform(size=rates[n_repeated:].shape)
+        expected.append(
+            tb.Mission.from_arrays(
+                start + new, mission.awareness, mission.contact_rate, features=mission.features
+            )
+        )
+        missions.append(replace(expected[-1], contact_rate=rates))
+
+    posteriors = [tb.fit(expected, PooledTrust(), progress=False)] * 6
+    table = tb.check(posteriors, missions).table
+    pit = tb.inference.score(posteriors, missions)["pit"].values
+    is_inside = np.abs(pit - 0.5) <= 0.45
+    share = is_inside[:, n_repeated:].mean()  # of missions of the same length
+
+    assert table.loc["new bounds", "stands_out"]
+    assert table.loc["new bounds", "size"] == pytest.approx(share - 0.9)
+    assert f"contain {share:.0%} of the rates" in table.loc["new bounds", "finding"]
+    assert not tb.check(posteriors, expected).table.loc["new bounds", "stands_out"]
+
+
 def test_coverage_is_not_tested_without_rates():
     first, other = drawn(n_missions=2)
     blank = np.full(other.contact_rate.shape, np.nan)
@@ -225,17 +255,6 @@ def with_one_beta(awareness, contact_rate=None):
     rates_of(beta * awareness[..., 0], contact_rate)
 
 
-def with_a_vector_beta(awareness, contact_rate=None):
-    beta = numpyro.sample("beta", dist.Normal(0.3, 0.3).expand([2]).to_event(1))
-    rates_of(beta.sum() * awareness[..., 0], contact_rate)
-
-
-def with_beta_of_robots(awareness, contact_rate=None):
-    with numpyro.plate("robot", awareness.shape[2]):
-        beta = numpyro.sample("beta", dist.Normal(0.3, 0.3))
-    rates_of(beta * awareness[..., 0], contact_rate)
-
-
 def with_signed_weights(awareness, contact_rate=None):
     """Weights whose axis of features comes first."""
     shape = awareness.shape[3], awareness.shape[2]
@@ -259,12 +278,24 @@ def test_places_are_not_tested_in_a_function_with_unknown_memory():
     assert "places" in found.verdict
 
 
-@pytest.mark.parametrize(
-    "model", [with_one_beta, with_a_vector_beta, with_beta_of_robots, of_places]
-)
-def test_weights_are_not_tested_without_weights_of_features(model):
-    found = checked(drawn(), model).table.loc["weights"]
+@pytest.fixture(scope="module")
+def of_one_beta():
+    return tb.fit(drawn(n_missions=2), with_one_beta, progress=False)
 
+
+@pytest.mark.parametrize("dims", [None, (), ("beta_dim_0",), ("robot",)])
+def test_weights_are_not_tested_without_weights_of_features(of_one_beta, dims):
+    """`beta` is missing, one number, a vector of a function, or one number of each robot."""
+    posterior = of_one_beta.copy()
+    for group in ("posterior", "prior"):
+        variables = posterior[group].to_dataset()
+        beta = variables["beta"]
+        variables = variables.drop_vars("beta")
+        if dims is not None:
+            variables["beta"] = beta.expand_dims(dict.fromkeys(dims, 3), -1) if dims else beta
+        posterior[group] = xr.DataTree(variables)
+
+    found = tb.check(posterior).table.loc["weights"]
     assert "no variable 'beta' with the dim 'feature'" in found["finding"]
     assert not found["stands_out"]
 
@@ -275,16 +306,17 @@ def test_a_weight_of_the_wrong_sign_stands_out_in_a_function():
     assert (found["label"], found["stands_out"]) == ("line_of_sight", True)
 
 
-def test_the_verdict_says_what_was_not_tested():
-    posterior = tb.fit(drawn(n_missions=2), with_one_beta, progress=False)
-    assert tb.check(posterior).verdict == "robots, places, weights and coverage were not tested."
+def test_the_verdict_says_what_was_not_tested(of_one_beta):
+    untested = "robots, places, weights, coverage and new bounds were not tested."
+    assert tb.check(of_one_beta).verdict == untested
 
-    found = tb.check([posterior, posterior], drawn(n_missions=2))
-    assert found.verdict.endswith("; robots, places and weights were not tested.")
+    # Both missions have the same path, so none of their bounds is new.
+    found = tb.check([of_one_beta, of_one_beta], drawn(n_missions=2))
+    assert found.verdict.endswith("; robots, places, weights and new bounds were not tested.")
 
     found = tb.check(tb.fit(drawn(robot=-0.5), MODEL, progress=False))
     assert found.verdict.startswith("r2")
-    assert found.verdict.endswith("; coverage was not tested.")
+    assert found.verdict.endswith("; coverage and new bounds were not tested.")
 
 
 @pytest.mark.slow

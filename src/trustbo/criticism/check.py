@@ -111,10 +111,12 @@ def check(
     is subtracted because a shift that most places share cannot be distinguished from the intercept.
     A weight stands out if its sign contradicts its prior. The coverage of 90 % intervals one
     mission ahead stands out if it differs from .9 by more than .05 and two standard errors over
-    missions. The verdict also names the checks that the model or the data do not allow: robots and
-    places need the effects of the model, weights a variable `beta` or `B` with the dim `feature`,
-    and coverage all posteriors of a campaign. Effects of places in a NumPyro function also need a
-    variable `beta0`.
+    missions. It is also computed for new bounds only, which none of the missions before had driven.
+    Intervals there can be too narrow although those on a path that is repeated are not. The verdict
+    also names the checks that the model or the data do not allow: robots and places need the
+    effects of the model, weights a variable `beta` or `B` with the dim `feature`, coverage all
+    posteriors of a campaign, and new bounds also paths. Effects of places in a NumPyro function
+    also need a variable `beta0`.
 
     See also `pit` of `tb.inference.score` for the shape of predictions, `tb.compare` for other
     models, and `az.psense_summary(posterior)` for the sensitivity to the priors.
@@ -147,11 +149,13 @@ def check(
 
     given = None if missions is None else list_of_missions(missions)
     robots = effects_of_robots(tree)
+    coverage, in_new_bounds = _check_coverage(trees, tree, given)
     findings = {
         "robots": _check_robots(robots),
         "places": _check_places(tree),
         "weights": _check_weights(tree),
-        "coverage": _check_coverage(trees, tree, given),
+        "coverage": coverage,
+        "new bounds": in_new_bounds,
     }
 
     table = pd.DataFrame(list(findings.values()), pd.Index(findings, name="check"))
@@ -341,24 +345,51 @@ def _weights(posterior: xr.DataTree, group: str, name: str) -> np.ndarray:
 
 def _check_coverage(
     trees: Sequence[xr.DataTree | None], last: xr.DataTree, missions: list[Mission] | None
-) -> Finding:
-    """Check whether 90 % intervals one mission ahead contain 90 % of the rates."""
+) -> tuple[Finding, Finding]:
+    """Check whether 90 % intervals one mission ahead contain 90 % of the rates.
+
+    Returns:
+        The findings for all bounds, and for bounds that no mission before had driven.
+    """
     if len(trees) < 2:
-        return Finding(_NOT_TESTED + "this check needs all posteriors of a campaign")
+        untested = Finding(_NOT_TESTED + "this check needs all posteriors of a campaign")
+        return untested, untested
 
     if missions is None:
         missions = trees.missions if isinstance(trees, Posteriors) else missions_of(last)
     if not predictions("check", trees, missions)[0]:
-        return Finding(_NOT_TESTED + "no mission has an earlier posterior that predicts it")
+        untested = Finding(_NOT_TESTED + "no mission has an earlier posterior that predicts it")
+        return untested, untested
 
     pit = score(trees, missions)["pit"]
+    is_new = np.zeros((pit.sizes["mission"], pit.sizes["bound"]), bool)
+    for row, j in zip(is_new, pit["mission"].values, strict=True):
+        driven = {station for mission in missions[:j] for station in mission.path or ()}
+        entered = missions[j].path or ()
+        new = [station not in driven for station in entered[1:]]
+        row[: len(new)] = new[: len(row)]
+
     is_inside = (abs(pit - 0.5) <= 0.5 * _COVERAGE).where(pit.notnull())
+    of_new = is_inside.where(xr.DataArray(is_new, dims=("mission", "bound")))
+    return (
+        _coverage(is_inside, "90 % intervals one mission ahead"),
+        _coverage(of_new, "90 % intervals in bounds that no mission before had driven"),
+    )
+
+
+def _coverage(is_inside: xr.DataArray, intervals: str) -> Finding:
+    """Compare the share of rates inside intervals with its nominal value.
+
+    Args:
+        is_inside: Whether each rate (mission, bound, robot) is inside; NaN where it is not tested.
+        intervals: Name of the intervals, for the finding.
+    """
     within = is_inside.mean(("bound", "robot")).dropna("mission")
     if not within.size:
-        return Finding(_NOT_TESTED + "no rate of the predicted missions was measured")
+        return Finding(f"{_NOT_TESTED}no rate was measured that {intervals} predict")
 
     share = float(within.mean())
     error = float(within.std(ddof=1)) / np.sqrt(within.size) if within.size > 1 else np.inf
     is_off = abs(share - _COVERAGE) > max(_TOLERANCE, _ERRORS * error)
-    words = f"90 % intervals one mission ahead contain {share:.0%} of the rates"
+    words = f"{intervals} contain {share:.0%} of the rates"
     return Finding(words, is_off, "90 %", share - _COVERAGE)
