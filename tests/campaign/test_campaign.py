@@ -292,9 +292,10 @@ def test_excluded_mission_is_forgotten_until_it_is_told_again(workspace):
     rest = [campaign.missions[j] for j in (0, 2)]
     again = fit(rest, PooledTrust(), seed=seed, draws=300, start=before)
     np.testing.assert_array_equal(again["posterior"]["beta"], posterior["posterior"]["beta"])
-    for n in (2, 4):  # excluded already; and none
-        with pytest.raises(tb.TrustboError, match=str(n)):
-            campaign.exclude(n, "again")
+    wrong = (2, "again", "lidar was covered"), (4, "again", "there are 3"), (1, " ", "empty")
+    for n, reason, named in wrong:
+        with pytest.raises(tb.TrustboError, match=named):
+            campaign.exclude(n, reason)
     campaign.tell(missions[1])
     assert campaign.posterior["constant_data"].sizes["mission"] == 3
     for n in (1, 3, 4):
@@ -363,7 +364,7 @@ def test_a_failure_without_rates_counts_until_a_user_excludes_it(workspace):
     with pytest.raises(tb.TrustboError, match="recorded already"):
         campaign.tell(told)
     assert campaign.hazard["failures"].values.sum() == 1
-    campaign.exclude(1, "")
+    campaign.exclude(1, "no rates")
     assert campaign.hazard["failures"].values.sum() == 0
 
 

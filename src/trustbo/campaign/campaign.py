@@ -359,8 +359,9 @@ class Campaign(Recorder):
         """
         if not isinstance(reason, str) or not reason.strip():
             raise TrustboError(f"reason must be a text such as {CAUSES[0]!r}; got {reason!r}.")
-        if reason.strip().lower() in CAUSES:  # as in tables
-            reason = reason.strip().lower()
+        cause = "_".join(reason.lower().replace("_", " ").split())
+        if cause in CAUSES:  # "Lost contact" is also read
+            reason = cause
 
         with self._turn:
             self.storage.require_open()

@@ -1,5 +1,6 @@
 """Recording of what happens in a campaign: it is written, and then learned from."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -115,19 +116,13 @@ class Recorder(Result):
             cannot be computed, a warning is issued, and the previous posterior is returned.
 
         Raises:
-            TrustboError: There is no such mission, it is already excluded by a user, or the
-                exclusion cannot be recorded. The mission is then not excluded.
+            TrustboError: There is no such mission, it is already excluded by a user, the reason is
+                empty, or the exclusion cannot be recorded. The mission is then not excluded.
         """
         with self._turn:
-            self.storage.require_open()
             entries = self.state.entries
-            if require_whole("n", n, 1) > len(entries):
-                raise TrustboError(
-                    f"there is no mission {n} to exclude; the last is mission {len(entries)}."
-                )
-            before = entries[n - 1].exclusion
-            if before is not None:
-                raise TrustboError(f"mission {n} is already excluded: {before.reason}")
+            before = [entry.exclusion and entry.exclusion.reason for entry in entries]
+            self._require_counts("mission", n, reason, before, "excluded")
 
             self._learn()
             entries = list(self.state.entries)
@@ -149,21 +144,33 @@ class Recorder(Result):
                 the withdrawal cannot be recorded. The report then still counts.
         """
         with self._turn:
-            self.storage.require_open()
             failures = list(self.state.failures)
-            if require_whole("n", n, 1) > len(failures):
-                raise TrustboError(
-                    f"there is no report {n} of `fail` to withdraw; there are {len(failures)}."
-                )
-            if not str(reason).strip():
-                raise TrustboError(f"reason must not be empty; got {reason!r}.")
-            before = failures[n - 1].withdrawn
-            if before:
-                raise TrustboError(f"report {n} of `fail` is already withdrawn: {before}")
+            before = [failure.withdrawn for failure in failures]
+            self._require_counts("report of `fail`", n, reason, before, "withdrawn")
 
             self._learn()
             failures[n - 1] = failures[n - 1]._replace(withdrawn=str(reason))
             self._record(failures=tuple(failures), asked=None)
+
+    def _require_counts(
+        self, what: str, n: int, reason: str, before: Sequence[str | None], done: str
+    ) -> None:
+        """Raise TrustboError unless mission or report n counts, and can be taken back.
+
+        Args:
+            what: "mission" or "report of `fail`".
+            n: Number, from 1.
+            reason: Reason for which it is taken back.
+            before: Reasons for which others were taken back; None or "" for those that count.
+            done: Participle for messages.
+        """
+        self.storage.require_open()
+        if require_whole("n", n, 1) > len(before):
+            raise TrustboError(f"there is no {what} with number {n}; there are {len(before)}.")
+        if not str(reason).strip():
+            raise TrustboError(f"reason must not be empty; got {reason!r}.")
+        if before[n - 1]:
+            raise TrustboError(f"{what} {n} is already {done}: {before[n - 1]}")
 
     def close(self) -> None:
         """Release the folder, so that others can use it; a campaign in memory can go on.
