@@ -267,6 +267,20 @@ def test_the_drive_back_from_the_goal_is_not_part_of_the_mission(field):
     assert back.duration[-1, 0] == 20.0
 
 
+@pytest.mark.parametrize("path", [PLANNED, None])
+def test_a_second_mission_in_the_same_log_is_warned_of(field, path):
+    other = [(3, 0), (2, 0), (1, 1), (0, 2), (0, 3)]
+    twice = driven(field, [*PLANNED, *PLANNED[-2::-1], *other[1:]])
+    with pytest.warns(UserWarning, match=r"returns to cell \(3, 0\).* 110 s after .*cut it"):
+        one = read_driven(field, *twice, path=path)
+    assert one.path[:4] == tuple(PLANNED)
+
+
+def test_a_planned_path_may_lead_through_its_start_again(field):
+    loop = [(3, 0), (2, 0), (2, 1), (3, 0), (3, 1)]
+    assert read_driven(field, *driven(field, loop), path=loop).path == tuple(loop)
+
+
 @pytest.mark.parametrize("shift", [25.0, -25.0, 5.0])
 def test_detections_outside_the_time_of_the_poses_are_warned_of(field, shift):
     poses, seen = driven(field, PLANNED)

@@ -51,6 +51,8 @@ def crossings_of(
             edges.append(k)
 
     _require_route(path, edges, entered, _doubts_of(ticks, n, tick))
+    if planned is None or path[0] not in path[1:]:
+        _warn_of_further_missions(path[0], edges[1], entered, tick)
 
     end = _end_of_visit(visits, edges[-1], path[len(edges) - 1], GAP / tick, n)
     if len(edges) < len(path) and end < n:
@@ -139,6 +141,19 @@ def _require_route(
             f"the lead never enters cell {path[n]}, number {n} of the path (0 is the start), so "
             f"there is no complete bound; the log begins in cell {first} and ends in {last}. Pass "
             f"the path of this mission, or use `Campaign.fail` if no bound was run.{hint}"
+        )
+
+
+def _warn_of_further_missions(
+    start: Cell, first: int, entered: Sequence[tuple[int, Cell]], tick: float
+) -> None:
+    """Warn if the lead, which leaves the start at a first tick, returns there and leaves again."""
+    again = [k for k, cell in entered if k > first and cell == start]
+    if again and entered[-1][1] != start:
+        warn(
+            f"the lead returns to cell {start}, where the path begins, {again[0] * tick:g} s after "
+            "the start of the log, and leaves it again. A log is read as one mission; cut it if it "
+            "has several."
         )
 
 

@@ -91,7 +91,7 @@ def read_tracks(
         UserWarning: A watcher is unknown, detections lie outside the time of the poses, the lead
             detects robots, the interval of detections is not the tick, poses are more than 5 s
             apart, a robot has no poses, is never seen or never watches, or the lead leaves the
-            planned path.
+            planned path or leaves the start twice.
 
     Example:
         >>> missions = tb.logs.read_tracks("poses.csv", "detections.csv", window=20.0)
