@@ -86,7 +86,7 @@ def expected_rate(family, trust, sd):
         return trust
 
     def integral(x):
-        return x * norm.cdf(x) + norm.pdf(x)
+        return x * special.ndtr(x) + np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
 
     return sd * (integral(trust / sd) - integral((trust - 1.0) / sd))  # of P(rate > t) over t
 

@@ -65,7 +65,7 @@ def own_mcmc(posterior):
     y = jnp.asarray(posterior["observed_data"]["contact_rate"].values)
     n_ticks = jnp.asarray(data["n_ticks"].values)
     mcmc = MCMC(
-        NUTS(copy_of_pooled, dense_mass=True, max_tree_depth=7), num_warmup=300, num_samples=1000,
+        NUTS(copy_of_pooled, dense_mass=True, max_tree_depth=7), num_warmup=200, num_samples=500,
         num_chains=2, chain_method="vectorized", progress_bar=False,
     )  # fmt: skip
     mcmc.run(jax.random.key(0), z, y, n_ticks)
