@@ -16,7 +16,8 @@ from trustbo.inference.functions.data import (
     observations_of,
     require_same_order,
 )
-from trustbo.inference.functions.function import FunctionModel
+from trustbo.inference.functions.function import FunctionModel, in_batches
+from trustbo.inference.mixtures import BATCH
 from trustbo.models.backend import own_settings
 from trustbo.models.draws import PLACES, Draws, Order
 from trustbo.models.params import assemble_params
@@ -96,25 +97,28 @@ class FunctionDrift:
         """
         data = self._data(z, bounds)
         n_draws = len(self.number)
-        size = max(1, _NUMBERS // data["awareness"][..., 0].size)
+        size = min(BATCH, max(1, _NUMBERS // data["awareness"][..., 0].size))
 
         parts = []
         for first in range(0, n_draws, size):
-            _, inputs = self._some(slice(first, first + size))._run(data)
+            _, inputs = self._some(slice(first, first + size))._run(data, size=size)
             part = _by_robot(getattr(inputs, field))[:, 0, : len(z)].swapaxes(1, 2)
             parts.append(part.sum(0, keepdims=True) if self.of_mean else part)
 
         found = np.concatenate(parts)
         return found.sum(0, keepdims=True) / n_draws if self.of_mean else found
 
-    def _run(self, data: Data, of_missions: Mapping[str, Any] | None = None) -> Any:
+    def _run(
+        self, data: Data, of_missions: Mapping[str, Any] | None = None, size: int = BATCH
+    ) -> Any:
         """Run the function; return the form (draw, group, member) and the inputs.
 
         `of_missions` are values of the variables of single missions; by default, they are drawn.
+        `size` is the number of draws for which the function is compiled; see `in_batches`.
         """
         values = {**self.values, **(of_missions or {})}
         run = self.model.over_draws("space_and_inputs", 2, data)
-        space, inputs = run(values, _keys(self.number))
+        space, inputs = in_batches(run, values, _keys(self.number), size=size)
 
         if inputs.drift.shape[1:3] != data["awareness"].shape[:2]:
             raise TrustboError(self._wrong_size())

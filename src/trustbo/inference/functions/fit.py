@@ -19,7 +19,7 @@ from trustbo.inference.functions.draws import (
     function_drift,
     no_weights,
 )
-from trustbo.inference.functions.function import FunctionModel
+from trustbo.inference.functions.function import FunctionModel, in_batches
 from trustbo.inference.functions.sampling import (
     NUTS,
     keys_of,
@@ -236,7 +236,7 @@ def _prior_drift(
     data = _nothing(model, n_robots, features)
     sites = model.sites(data)
 
-    drawn = model.over_draws("prior", 1, data)(keys_of(n_draws, seed))
+    drawn = in_batches(model.over_draws("prior", 1, data), keys_of(n_draws, seed))
     values = {name: drawn[name] for name, site in sites.items() if site.mission_axis is None}
     if not values:
         raise TrustboError(f"{model.in_short()} has no variable that is common to all missions.")

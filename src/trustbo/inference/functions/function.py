@@ -36,6 +36,7 @@ from trustbo.inference.functions.sites import (
     plates_of_rates,
     site_of,
 )
+from trustbo.inference.mixtures import BATCH
 from trustbo.models.backend import own_settings
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Effect
@@ -518,6 +519,25 @@ class FunctionModel:
         """Call a compiled function with the settings and error messages of this module."""
         with own_settings(), explained(self.in_short(), data):
             return jax.tree.map(np.asarray, compiled(*arguments))
+
+
+def in_batches(compiled: Callable[..., Any], *draws: Any, size: int = BATCH) -> Any:
+    """Call a compiled function for some draws at a time, and concatenate the results.
+
+    It is compiled for one number of draws, because a call with fewer ones repeats some of them.
+
+    Args:
+        compiled: Function of draws, as from `FunctionModel.over_draws`.
+        draws: Its arguments, whose arrays have the axis (draw,).
+        size: Number of draws in a call.
+    """
+    n = len(jax.tree.leaves(draws)[0])
+    repeated = np.resize(np.arange(n), n + -n % size)
+    parts = [
+        compiled(*jax.tree.map(lambda a, some=some: a[some], draws))
+        for some in repeated.reshape(-1, size)
+    ]
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:n], *parts)
 
 
 class _WithoutRates(Messenger):

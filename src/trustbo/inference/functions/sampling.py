@@ -17,7 +17,7 @@ from trustbo.inference.functions.coordinates import Coordinates
 from trustbo.inference.functions.data import RATES, Data
 from trustbo.inference.functions.effects import AddedEffects
 from trustbo.inference.functions.explain import reason_of
-from trustbo.inference.functions.function import FunctionModel, Outer
+from trustbo.inference.functions.function import FunctionModel, Outer, in_batches
 from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.nuts import Chains, Samples, Start, Tuning
 from trustbo.inference.options import Options
@@ -150,19 +150,8 @@ class Target:
         return self._in_batches("values", one, x)
 
     def _in_batches(self, name: str, compute: Callable[..., Any], draws: Any) -> Any:
-        """Compute a function of draws, whose arrays have the axis (draw,).
-
-        It is compiled for one number of draws.
-        """
-        compiled = self.compiled((name,), compute, 1)
-        n = len(jax.tree.leaves(draws)[0])
-        n_missing = -n % mixtures.BATCH
-        whole = jax.tree.map(lambda a: np.concatenate([a, a[:1].repeat(n_missing, 0)]), draws)
-        parts = [
-            compiled(jax.tree.map(lambda a, k=k: a[k : k + mixtures.BATCH], whole))
-            for k in range(0, n, mixtures.BATCH)
-        ]
-        return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:n], *parts)
+        """Compute a function of draws, whose arrays have the axis (draw,); see `in_batches`."""
+        return in_batches(self.compiled((name,), compute, 1), draws)
 
     def compiled(
         self, key: tuple[Any, ...], compute: Callable[..., Any], n_draw_axes: int
