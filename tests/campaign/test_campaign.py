@@ -293,7 +293,7 @@ def test_excluded_mission_is_forgotten_until_it_is_told_again(workspace):
     again = fit(rest, PooledTrust(), seed=seed, draws=300, start=before)
     np.testing.assert_array_equal(again["posterior"]["beta"], posterior["posterior"]["beta"])
     wrong = (2, "again", "lidar was covered"), (4, "again", "there are 3"), (1, " ", "empty")
-    for n, reason, named in wrong:
+    for n, reason, named in (*wrong, (1, None, "None")):
         with pytest.raises(tb.TrustboError, match=named):
             campaign.exclude(n, reason)
     campaign.tell(missions[1])

@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -67,6 +68,33 @@ def test_campaign_driven_by_turns_from_four_threads_equals_the_serial_one(worksp
     expected = numbers(serial)
     same(campaign, expected)
     same(tb.load_result(tmp_path / "threads"), expected)
+
+
+def test_a_thread_that_waits_while_a_campaign_moves_to_a_folder_loses_nothing(workspace, tmp_path):
+    """The lock for which the thread waits is the one that the campaign uses afterwards."""
+    campaign = begin(workspace, None)
+    with campaign._turn:
+        waiting = threading.Thread(target=campaign.fail, args=("rain",))
+        waiting.start()
+        campaign.store_in(tmp_path / "c")
+
+        write, is_writing = campaign.storage.write, []
+
+        def checked(state):
+            is_writing.append(None)
+            assert len(is_writing) == 1
+            time.sleep(0.2)
+            write(state)
+            is_writing.pop()
+
+        campaign.storage.write = checked
+    campaign.fail("snow")
+    waiting.join()
+
+    reasons = {failure.reason for failure in campaign.state.failures}
+    assert reasons == {"rain", "snow"}
+    campaign.close()
+    assert len(tb.Campaign.load(tmp_path / "c").state.failures) == 2
 
 
 def test_missions_told_at_once_are_all_recorded_and_learned(workspace, tmp_path):

@@ -465,7 +465,8 @@ class Campaign(Recorder):
             campaign = cls(workspace, model=learner.model, **arguments)
             campaign.state = state
             campaign._progress = progress
-            campaign._use(FolderStorage(lock, files, workspace))
+            campaign.storage = FolderStorage(lock, files, workspace)
+            campaign._turn = campaign.storage.turn
             if state.fitted != state.used:
                 if progress:
                     n = len(state.entries)

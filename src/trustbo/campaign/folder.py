@@ -23,7 +23,7 @@ contains is recorded. If the process dies during `tell`, the following happens:
 import json
 import os
 from collections.abc import Callable, Container, Iterator
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
@@ -96,6 +96,7 @@ class FolderStorage:
         *,
         overwrite: bool,
         take_over: bool = False,
+        turn: AbstractContextManager[Any] | None = None,
     ) -> Self:
         """Lock a folder and write a whole campaign.
 
@@ -108,6 +109,7 @@ class FolderStorage:
             state: State of the campaign.
             overwrite: Whether to replace an existing campaign in the folder.
             take_over: Whether to close an older campaign of this process that uses the folder.
+            turn: Lock of the campaign between threads; by default, a new one.
 
         Raises:
             TrustboError: Another campaign uses the folder; it contains a campaign and `overwrite`
@@ -120,7 +122,7 @@ class FolderStorage:
 
         is_new = not path.exists()
         _make_folder(path)
-        lock = FolderLock(path, take_over=take_over)
+        lock = FolderLock(path, take_over=take_over, turn=turn)
 
         try:
             recover(lock.path)

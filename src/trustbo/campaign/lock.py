@@ -5,8 +5,9 @@ import os
 import threading
 import warnings
 import weakref
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from filelock import FileLock, SoftFileLock, Timeout
 
@@ -28,11 +29,18 @@ class FolderLock:
         turn: Lock between threads, held by a campaign during each operation.
     """
 
-    def __init__(self, path: Path, *, take_over: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        take_over: bool = False,
+        turn: AbstractContextManager[Any] | None = None,
+    ) -> None:
         """Lock an existing folder.
 
         Args:
             path: Folder.
+            turn: Lock of a campaign that other threads use already; by default, a new one.
             take_over: Whether to release the lock of an older campaign of this process, as when a
                 cell of a notebook is run again.
 
@@ -40,7 +48,7 @@ class FolderLock:
             TrustboError: Another campaign uses the folder, or the folder cannot be written.
         """
         self.path = path.absolute()
-        self.turn = threading.RLock()
+        self.turn = threading.RLock() if turn is None else turn
         self._why_released = ""
         self._process = os.getpid()
         self._folder = _identity(self.path)

@@ -42,19 +42,20 @@ class Recorder(Result):
             TrustboError: The folder already contains a campaign or cannot be written.
         """
         with self._turn:
+            # Other threads may be waiting for the campaign's lock, which therefore stays the same.
             storage = FolderStorage.begin(
-                directory, self.workspace, self.state, overwrite=overwrite, take_over=overwrite
+                directory,
+                self.workspace,
+                self.state,
+                overwrite=overwrite,
+                take_over=overwrite,
+                turn=self._turn,
             )
             storage.adopt(self.state)
 
             before = self.storage
-            self._use(storage)
+            self.storage = storage
             before.close()
-
-    def _use(self, storage: FolderStorage) -> None:
-        """Record everything in a folder from now on."""
-        self.storage = storage
-        self._turn = storage.turn
 
     def _record(self, **changes: Any) -> None:
         """Change the state and write it; if this fails, nothing has changed."""
@@ -126,7 +127,7 @@ class Recorder(Result):
 
             self._learn()
             entries = list(self.state.entries)
-            exclusion = Exclusion(len(entries), str(reason))
+            exclusion = Exclusion(len(entries), reason)
             entries[n - 1] = replace(entries[n - 1], exclusion=exclusion)
             self._record(entries=tuple(entries), asked=None)
             self._learn_and_write(f"the exclusion of mission {n} is recorded")
@@ -149,7 +150,7 @@ class Recorder(Result):
             self._require_counts("report of `fail`", n, reason, before, "withdrawn")
 
             self._learn()
-            failures[n - 1] = failures[n - 1]._replace(withdrawn=str(reason))
+            failures[n - 1] = failures[n - 1]._replace(withdrawn=reason)
             self._record(failures=tuple(failures), asked=None)
 
     def _require_counts(
@@ -167,8 +168,8 @@ class Recorder(Result):
         self.storage.require_open()
         if require_whole("n", n, 1) > len(before):
             raise TrustboError(f"there is no {what} with number {n}; there are {len(before)}.")
-        if not str(reason).strip():
-            raise TrustboError(f"reason must not be empty; got {reason!r}.")
+        if not isinstance(reason, str) or not reason.strip():
+            raise TrustboError(f"reason must be a text that is not empty; got {reason!r}.")
         if before[n - 1]:
             raise TrustboError(f"{what} {n} is already {done}: {before[n - 1]}")
 
