@@ -185,8 +185,33 @@ def test_intervals_that_are_too_narrow_only_in_new_bounds_stand_out():
 
     assert table.loc["new bounds", "stands_out"]
     assert table.loc["new bounds", "size"] == pytest.approx(share - 0.9)
-    assert f"contain {share:.0%} of the rates" in table.loc["new bounds", "finding"]
+    assert f"contain {share:.0%} of the rates of a mission" in table.loc["new bounds", "finding"]
     assert not tb.check(posteriors, expected).table.loc["new bounds", "stands_out"]
+
+
+def test_a_bound_is_new_until_a_rate_was_measured_in_it():
+    """Bounds lead from a cell to a cell; those that a mission has planned may be new."""
+    rng = np.random.default_rng(0)
+
+    def mission(path, rates, status="ok"):
+        z = rng.uniform(0.4, 0.6, size=(len(rates), 3, 1))
+        y = np.repeat(np.array(rates)[:, None], 3, axis=1)
+        return tb.Mission.from_arrays(path, z, y, status=status, features=["line_of_sight"])
+
+    usual = [(3, 0), (2, 1), (1, 2), (0, 3)]
+    other = [(3, 0), (2, 0), (1, 1), (0, 2), (0, 3)]
+    between = [(3, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 3)]  # three bounds are new
+    driven = [
+        mission(usual, [0.5, 0.5, 0.5]),
+        mission(other, [0.5, 0.5], status="aborted"),
+        mission(other, [0.5, 0.5, 0.0, 0.0]),  # two bounds are new, and far from predictions
+        mission(between, [0.5, 0.0, 0.0, 0.0, 0.5]),
+    ]
+    posteriors = [tb.fit(driven[:2], PooledTrust(), progress=False)] * 4
+    table = tb.check(posteriors, driven).table
+
+    # The mission that was aborted is all new, and inside; the others are outside.
+    assert "33%" in table.loc["new bounds", "finding"]
 
 
 def test_coverage_is_not_tested_without_rates():

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from trustbo.data import Mission
+from trustbo.data import Mission, Station
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError
 from trustbo.inference.params import (
@@ -111,8 +112,9 @@ def check(
     is subtracted because a shift that most places share cannot be distinguished from the intercept.
     A weight stands out if its sign contradicts its prior. The coverage of 90 % intervals one
     mission ahead stands out if it differs from .9 by more than .05 and two standard errors over
-    missions. It is also computed for new bounds only, which none of the missions before had driven.
-    Intervals there can be too narrow although those on a path that is repeated are not. The verdict
+    missions, in each of which the share is computed. It is also computed for new bounds only, in
+    which none of the missions before had measured a rate. Intervals there can be too narrow
+    although those on a path that is repeated are not. The verdict
     also names the checks that the model or the data do not allow: robots and places need the
     effects of the model, weights a variable `beta` or `B` with the dim `feature`, coverage all
     posteriors of a campaign, and new bounds also paths. Effects of places in a NumPyro function
@@ -349,7 +351,7 @@ def _check_coverage(
     """Check whether 90 % intervals one mission ahead contain 90 % of the rates.
 
     Returns:
-        The findings for all bounds, and for bounds that no mission before had driven.
+        The findings for all bounds, and for bounds in which no mission before had measured a rate.
     """
     if len(trees) < 2:
         untested = Finding(_NOT_TESTED + "this check needs all posteriors of a campaign")
@@ -364,21 +366,27 @@ def _check_coverage(
     pit = score(trees, missions)["pit"]
     is_new = np.zeros((pit.sizes["mission"], pit.sizes["bound"]), bool)
     for row, j in zip(is_new, pit["mission"].values, strict=True):
-        driven = {station for mission in missions[:j] for station in mission.path or ()}
-        entered = missions[j].path or ()
-        new = [station not in driven for station in entered[1:]]
+        measured = {bound for mission in missions[:j] for bound in _measured(mission)}
+        new = [bound not in measured for bound in pairwise(missions[j].path or ())]
         row[: len(new)] = new[: len(row)]
 
     is_inside = (abs(pit - 0.5) <= 0.5 * _COVERAGE).where(pit.notnull())
     of_new = is_inside.where(xr.DataArray(is_new, dims=("mission", "bound")))
     return (
         _coverage(is_inside, "90 % intervals one mission ahead"),
-        _coverage(of_new, "90 % intervals in bounds that no mission before had driven"),
+        _coverage(of_new, "90 % intervals in bounds that no mission before had measured"),
     )
 
 
+def _measured(mission: Mission) -> list[tuple[Station, Station]]:
+    """Return the bounds of a mission in which a rate was measured."""
+    has_rate = np.isfinite(mission.contact_rate).any(-1)
+    bounds = pairwise(mission.path or ())
+    return [bound for bound, known in zip(bounds, has_rate, strict=False) if known]
+
+
 def _coverage(is_inside: xr.DataArray, intervals: str) -> Finding:
-    """Compare the share of rates inside intervals with its nominal value.
+    """Compare the share of rates inside intervals, a mean over missions, with its nominal value.
 
     Args:
         is_inside: Whether each rate (mission, bound, robot) is inside; NaN where it is not tested.
@@ -391,5 +399,5 @@ def _coverage(is_inside: xr.DataArray, intervals: str) -> Finding:
     share = float(within.mean())
     error = float(within.std(ddof=1)) / np.sqrt(within.size) if within.size > 1 else np.inf
     is_off = abs(share - _COVERAGE) > max(_TOLERANCE, _ERRORS * error)
-    words = f"{intervals} contain {share:.0%} of the rates"
+    words = f"{intervals} contain {share:.0%} of the rates of a mission"
     return Finding(words, is_off, "90 %", share - _COVERAGE)

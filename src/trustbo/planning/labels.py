@@ -85,10 +85,10 @@ def best_labels(
 def _best_labels(graph, costs, max_labels, cost, lower, paths, begin, end):
     """Write the results of `_best_path` for the draws from `begin` to `end`."""
     loss, drift, weight, start, transition, x0, sd, bound_cost, risk, failure, share, limit = costs
-    failing = bound_cost, risk, failure, share, limit
+    shared = bound_cost, risk, failure, share, limit
     for d in range(begin, end):
         trust = transition[d], x0[d], sd[d]
-        one = Costs(loss, drift[d], weight[d], start[d], *trust, *failing)
+        one = Costs(loss, drift[d], weight[d], start[d], *trust, *shared)
         cost[d], lower[d] = _best_path(graph, one, max_labels, paths[d])
 
 
