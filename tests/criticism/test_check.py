@@ -185,7 +185,8 @@ def test_intervals_that_are_too_narrow_only_in_new_bounds_stand_out():
 
     assert table.loc["new bounds", "stands_out"]
     assert table.loc["new bounds", "size"] == pytest.approx(share - 0.9)
-    assert f"contain {share:.0%} of the rates of a mission" in table.loc["new bounds", "finding"]
+    assert f"contain {share:.0%} of 30 rates" in table.loc["new bounds", "finding"]
+    assert "too narrow" in table.loc["new bounds", "finding"]
     assert not tb.check(posteriors, expected).table.loc["new bounds", "stands_out"]
 
 
@@ -210,8 +211,9 @@ def test_a_bound_is_new_until_a_rate_was_measured_in_it():
     posteriors = [tb.fit(driven[:2], PooledTrust(), progress=False)] * 4
     table = tb.check(posteriors, driven).table
 
-    # The mission that was aborted is all new, and inside; the others are outside.
-    assert "33%" in table.loc["new bounds", "finding"]
+    # Of seven new bounds, the two of the mission that was aborted are as predicted.
+    assert "29% of 21 rates" in table.loc["new bounds", "finding"]
+    assert not table.loc["new bounds", "stands_out"]  # three missions are too few
 
 
 def test_coverage_is_not_tested_without_rates():

@@ -267,13 +267,19 @@ def test_the_drive_back_from_the_goal_is_not_part_of_the_mission(field):
     assert back.duration[-1, 0] == 20.0
 
 
-@pytest.mark.parametrize("path", [PLANNED, None])
-def test_a_second_mission_in_the_same_log_is_warned_of(field, path):
+def test_a_second_mission_in_the_same_log_is_not_read_as_a_part_of_the_first(field):
     other = [(3, 0), (2, 0), (1, 1), (0, 2), (0, 3)]
     twice = driven(field, [*PLANNED, *PLANNED[-2::-1], *other[1:]])
-    with pytest.warns(UserWarning, match=r"returns to cell \(3, 0\).* 110 s after .*cut it"):
-        one = read_driven(field, *twice, path=path)
-    assert one.path[:4] == tuple(PLANNED)
+    with pytest.warns(UserWarning, match=r"returns to cell \(3, 0\).* 110 s after .*only"):
+        one = read_driven(field, *twice)
+    assert (one.path, one.status) == (tuple(PLANNED), "ok")
+    assert one.duration[:2, 0].tolist() == [20.0, 20.0]
+
+    with pytest.raises(TrustboError, match=r"returns to cell \(3, 0\).* 110 s after .*Cut"):
+        read_driven(field, *twice, path=None)
+    half = driven(field, [*PLANNED[:2], *PLANNED])  # given up, and begun again
+    with pytest.raises(TrustboError, match=r"returns to cell \(3, 0\)"):
+        read_driven(field, *half)
 
 
 def test_a_planned_path_may_lead_through_its_start_again(field):

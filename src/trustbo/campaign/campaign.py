@@ -349,19 +349,25 @@ class Campaign(Recorder):
         Args:
             reason: Reason to store in the table of missions. Reasons in `hazard.CAUSES`, such as
                 "stuck", mean that a bound of the plan failed, and only these are used to learn the
-                hazard. If another reason contains one of them, a warning is issued.
+                hazard.
             where: Cell that the team failed to enter, if known.
 
         Raises:
-            TrustboError: The reason is empty, a bound failed although no path is planned, the plan
-                does not enter `where`, `where` is given but the reason is not in `hazard.CAUSES`,
-                or the failure cannot be recorded. The failure is then not counted.
+            TrustboError: The reason is empty or contains a cause without being one, such as "got
+                stuck"; a bound failed although no path is planned; the plan does not enter `where`;
+                `where` is given but the reason is not in `hazard.CAUSES`; or the failure cannot be
+                recorded. The failure is then not counted.
         """
         if not isinstance(reason, str) or not reason.strip():
             raise TrustboError(f"reason must be a text such as {CAUSES[0]!r}; got {reason!r}.")
         cause = "_".join(reason.lower().replace("_", " ").split())
         if cause in CAUSES:  # "Lost contact" is also read
             reason = cause
+        elif named := [known for known in CAUSES if known in cause]:
+            raise TrustboError(
+                f"the reason {reason!r} names a cause, but is not one, and nothing was recorded. "
+                f"Write {named[0]!r} if a bound failed, or else a reason without this word."
+            )
 
         with self._turn:
             self.storage.require_open()
@@ -383,13 +389,6 @@ class Campaign(Recorder):
             self._learn()
             failure = Failure(len(self.state.entries), reason, tuple(path), where)
             self._record(failures=(*self.state.failures, failure), asked=None)
-
-        named = [cause for cause in CAUSES if cause in reason.lower().replace(" ", "_")]
-        if named and reason not in CAUSES:
-            warn(
-                f"the reason {reason!r} does not count as a failed bound. If a bound failed, "
-                f"report {named[0]!r} after the next ask."
-            )
 
     def run(
         self,

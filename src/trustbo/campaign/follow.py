@@ -156,6 +156,8 @@ class Follower(Summary):
                 or `t` is before the previous time.
         """
         self._require(running=True, t=t)
+        if t == self._begun:
+            raise TrustboError(f"the bound begins at t = {t} s and must end at a later time.")
         require_choice("status", status, STATUSES)
         unknown = np.full((self._counts.shape[1], len(self._workspace.features)), np.nan)
         seconds = np.full(len(unknown), t - self._begun)
@@ -176,7 +178,7 @@ class Follower(Summary):
 
         After a bound has failed, the rest avoids it. If the team is in the previous cell, the next
         bound of `path` leads back there, and its ticks count like those of other bounds. If the
-        team is already back, call `begin` and `end` without ticks.
+        team is already back, call `begin` and, at a later time, `end` without ticks.
 
         Args:
             cell: Cell in which the team is; by default the cell of the last bound or, if that bound

@@ -41,6 +41,8 @@ _TOLERANCE = 0.05
 """Tolerated error of the coverage of these intervals."""
 _ERRORS = 2.0
 """Number of standard errors above which a difference is significant."""
+_FEWEST = 4
+"""Fewest predicted missions from which such an error is estimated."""
 _OF_DRAWS = ("chain", "draw")
 _NOT_TESTED = "not tested: "
 """Start of a finding that states why a check was not possible."""
@@ -112,7 +114,7 @@ def check(
     is subtracted because a shift that most places share cannot be distinguished from the intercept.
     A weight stands out if its sign contradicts its prior. The coverage of 90 % intervals one
     mission ahead stands out if it differs from .9 by more than .05 and two standard errors over
-    missions, in each of which the share is computed. It is also computed for new bounds only, in
+    missions, and at least four missions are predicted. It is also computed for new bounds only, in
     which none of the missions before had measured a rate. Intervals there can be too narrow
     although those on a path that is repeated are not. The verdict
     also names the checks that the model or the data do not allow: robots and places need the
@@ -386,18 +388,31 @@ def _measured(mission: Mission) -> list[tuple[Station, Station]]:
 
 
 def _coverage(is_inside: xr.DataArray, intervals: str) -> Finding:
-    """Compare the share of rates inside intervals, a mean over missions, with its nominal value.
+    """Compare the share of rates inside intervals with its nominal value.
+
+    Rates of a mission have common errors, so the standard error is that of a ratio over missions,
+    and at least that of independent rates.
 
     Args:
         is_inside: Whether each rate (mission, bound, robot) is inside; NaN where it is not tested.
         intervals: Name of the intervals, for the finding.
     """
-    within = is_inside.mean(("bound", "robot")).dropna("mission")
-    if not within.size:
+    n = is_inside.count(("bound", "robot")).values
+    n_inside = is_inside.sum(("bound", "robot")).values[n > 0]
+    n = n[n > 0]
+    if not n.size:
         return Finding(f"{_NOT_TESTED}no rate was measured that {intervals} predict")
 
-    share = float(within.mean())
-    error = float(within.std(ddof=1)) / np.sqrt(within.size) if within.size > 1 else np.inf
-    is_off = abs(share - _COVERAGE) > max(_TOLERANCE, _ERRORS * error)
-    words = f"{intervals} contain {share:.0%} of the rates of a mission"
-    return Finding(words, is_off, "90 %", share - _COVERAGE)
+    share = float(n_inside.sum() / n.sum())
+    error = np.sqrt(_COVERAGE * (1.0 - _COVERAGE) / n.sum())
+    if n.size >= _FEWEST:
+        residuals = n_inside - share * n
+        over_missions = np.sqrt(n.size / (n.size - 1) * (residuals**2).sum()) / n.sum()
+        error = max(error, over_missions)
+
+    off = share - _COVERAGE
+    is_off = n.size >= _FEWEST and abs(off) > max(_TOLERANCE, _ERRORS * error)
+    words = f"{intervals} contain {share:.0%} of {n.sum()} rates"
+    if is_off:
+        words += " and are too wide" if off > 0.0 else " and are too narrow"
+    return Finding(words, is_off, "90 %", off)

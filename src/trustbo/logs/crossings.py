@@ -52,7 +52,8 @@ def crossings_of(
 
     _require_route(path, edges, entered, _doubts_of(ticks, n, tick))
     if planned is None or path[0] not in path[1:]:
-        _warn_of_further_missions(path[0], edges[1], entered, tick)
+        is_complete = planned is not None and len(edges) == len(path)
+        _require_one_mission(path[0], edges, entered, tick, is_complete=is_complete)
 
     end = _end_of_visit(visits, edges[-1], path[len(edges) - 1], GAP / tick, n)
     if len(edges) < len(path) and end < n:
@@ -144,17 +145,33 @@ def _require_route(
         )
 
 
-def _warn_of_further_missions(
-    start: Cell, first: int, entered: Sequence[tuple[int, Cell]], tick: float
+def _require_one_mission(
+    start: Cell,
+    edges: Sequence[int],
+    entered: Sequence[tuple[int, Cell]],
+    tick: float,
+    *,
+    is_complete: bool,
 ) -> None:
-    """Warn if the lead, which leaves the start at a first tick, returns there and leaves again."""
-    again = [k for k, cell in entered if k > first and cell == start]
-    if again and entered[-1][1] != start:
-        warn(
-            f"the lead returns to cell {start}, where the path begins, {again[0] * tick:g} s after "
-            "the start of the log, and leaves it again. A log is read as one mission; cut it if it "
-            "has several."
+    """Raise TrustboError if the lead returns to the start and leaves it again.
+
+    If the planned path is complete before (`is_complete`), what follows is not read, with a
+    warning.
+    """
+    again = [k for k, cell in entered if k > edges[1] and cell == start]
+    if not again or entered[-1][1] == start:
+        return
+
+    text = (
+        f"the lead returns to cell {start}, where the path begins, {again[0] * tick:g} s after the "
+        "start of the log, and leaves it again"
+    )
+    if not is_complete or again[0] < edges[-1]:
+        raise TrustboError(
+            f"{text}. Cut the log if it has several missions, or pass the path that was driven if "
+            "it leads through its start again."
         )
+    warn(f"{text}; only the mission before is read. Cut the log if it has several missions.")
 
 
 def _end_of_visit(

@@ -84,14 +84,15 @@ def read_tracks(
     Raises:
         TrustboError: Values, times, poses or units are invalid, the detections have a further
             column, no detection is between two robots with poses, the lead is unknown, it misses a
-            cell of the given path, a status is given although it reaches the last cell, or the log
-            has no complete bound.
+            cell of the given path, it leaves the start twice before it has driven the planned path,
+            a status is given although it reaches the last cell, or the log has no complete bound.
 
     Warns:
         UserWarning: A watcher is unknown, detections lie outside the time of the poses, the lead
             detects robots, the interval of detections is not the tick, poses are more than 5 s
-            apart, a robot has no poses, is never seen or never watches, or the lead leaves the
-            planned path or leaves the start twice.
+            apart, a robot has no poses, is never seen or never watches, the lead leaves the
+            planned path or starts again after it, or the path has no sets of posts although the
+            workspace has several.
 
     Example:
         >>> missions = tb.logs.read_tracks("poses.csv", "detections.csv", window=20.0)
@@ -129,6 +130,7 @@ def read_tracks(
         of_name = places.loc[places["robot"] == name]
         if workspace is not None and len(of_name):
             cells, edges = crossings_of(of_name, n, tick, workspace.grid, path)
+            _warn_of_unnamed_posts(cells, workspace)
 
         of_lead = pairs.loc[pairs["lead"] == name]
         if len(edges) > 1 and len(of_lead):
@@ -167,6 +169,15 @@ def _leads(lead: str | None, robots: Sequence[str], workspace: Workspace | None)
     if workspace is not None and len(leads) != 1:
         raise TrustboError(f"a log with a map has one lead; pass lead=, one of {others or robots}.")
     return leads
+
+
+def _warn_of_unnamed_posts(path: Sequence[Station], workspace: Workspace) -> None:
+    """Warn of a path without names of sets of posts in a workspace that has several."""
+    if workspace.n_posts > 1 and all(len(station) == 2 for station in path):
+        warn(
+            "the path has no sets of posts, so the subteam counts as being at the standard ones; "
+            "pass the path of the plan, or find the sets by workspace.with_posts(mission, ...)."
+        )
 
 
 def _pairs(places: pd.DataFrame, looks: pd.DataFrame) -> pd.DataFrame:
