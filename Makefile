@@ -67,8 +67,11 @@ docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
 	@echo "open out/docs/index.html"
 
+# A script that fails does not stop the others.
 bench: $(VENV)/.installed-bench
-	for script in benchmarks/*.py; do $(BIN)/python $$script || exit 1; done
+	@failed=; for script in benchmarks/*.py; do \
+		echo "$$script" && $(BIN)/python $$script || failed="$$failed $$script"; \
+	done; [ -z "$$failed" ] || { echo "failed:$$failed"; exit 1; }
 
 peers: $(VENV)/.installed
 	$(PIP) --dry-run --editable ".[bench,notebook]"

@@ -27,7 +27,9 @@ def main():
     parser = arguments(__doc__, names=("soh", "azevedo"), data=True)
     given = parsed(parser)
     if given.data is None:
-        parser.error("give --data or set TRUSTBO_DATA; the script's docstring lists the files")
+        print("The tables of people are not run: give --data or set TRUSTBO_DATA (see --help).")
+        return
+
     folder = given.data / "humans" if (given.data / "humans").is_dir() else given.data
     for name in given.names:
         {"soh": soh, "azevedo": azevedo}[name](folder)
