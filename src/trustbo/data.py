@@ -48,7 +48,7 @@ MEASURED = ("awareness", "contact_rate", "duration", "n_ticks")
 """Names of the arrays of a mission, which have the axes bound and robot."""
 _DIMS = ("bound", "robot", "feature")
 """Axes of awareness, in order; the other arrays have the first two."""
-_COLUMNS = (*MEASURED, "bound_status", "starts", "poses", "contact")
+OF_BOUNDS = (*MEASURED, "bound_status", "starts", "poses", "contact")
 """What a mission holds of each bound, in the order of the attributes of `Bound` after the cell."""
 
 
@@ -470,7 +470,7 @@ class Mission(Summary):
     def bounds(self) -> tuple[Bound, ...]:
         """Bounds that were run, whose arrays are views of those of the mission."""
         cells = cells_of(self.driven[1:]) or [NOWHERE] * len(self.contact_rate)
-        columns = (getattr(self, name) for name in _COLUMNS)
+        columns = (getattr(self, name) for name in OF_BOUNDS)
 
         return tuple(Bound(*values) for values in zip(cells, *columns, strict=True))
 

@@ -422,7 +422,7 @@ def test_causes_are_read_as_people_write_them(workspace):
     path = campaign.ask().path
     campaign.fail(" Stuck")
     assert campaign.state.lost == [LostMission(path)]
-    with pytest.raises(tb.TrustboError, match="nothing was recorded.* 'stuck'"):
+    with pytest.raises(tb.TrustboError, match="nothing was recorded"):
         campaign.fail("The lead was Stuck in my office")
     assert len(campaign.state.failures) == 1
     assert campaign.state.lost == [LostMission(path)]

@@ -345,5 +345,6 @@ def test_a_bound_that_stopped_robots_is_not_planned_again_with_its_next_move(log
         new = campaign.replan(path[k], told(path[: k + 2], stuck)).path
         campaign.tell(told(new, stuck + ["ok"] * (len(new) - k - 2)))
 
+    assert campaign.risk.failures[planned] == campaign.risk.failures.sum() == 1.0
     assert campaign.risk.mean[planned] > max(0.1, 2.0 * before)
     assert planned not in [tuple(bound) for bound in pairs_along(campaign.ask().path, 1)]

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.state import Posterior, State, why_never_learned
-from trustbo.data import Mission
+from trustbo.data import OF_BOUNDS, Mission, cells_of
 from trustbo.errors import PosteriorError, TrustboError, warn
 from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard
@@ -194,19 +194,59 @@ def missions_of_hazard(
     """Return the measured missions from which the hazard is learned, with their numbers.
 
     The numbers are those of `Result.table`; missions of earlier campaigns have none. A mission in
-    progress comes last. See `learn_hazard`.
+    progress comes last. A mission that was replanned after a failure is split; see `_parts`. See
+    `learn_hazard`.
     """
     measured: list[tuple[int | None, Mission]] = [
         (None, mission) for mission in state.earlier.missions if not mission.map
     ]
     for number, entry in enumerate(state.entries, start=1):
         if entry.exclusion is None:
-            measured.append((number, _with_planned_path(entry.measured, entry.plan)))
+            measured += [(number, part) for part in _parts(entry.measured, entry.plan)]
     if so_far is not None:
-        plan = state.asked
-        mission = so_far if plan is None else _with_planned_path(so_far, plan)
-        measured.append((len(state.entries) + 1, mission))
+        parts = [so_far] if state.asked is None else _parts(so_far, state.asked)
+        measured += [(len(state.entries) + 1, part) for part in parts]
     return measured
+
+
+def _parts(mission: Mission, plan: Plan) -> list[Mission]:
+    """Split a mission where a bound failed and it was replanned, and add the planned cells.
+
+    Each part ends with the cells that were planned when its last bound failed. The way back from a
+    bound that failed belongs to no part if it was completed, as in `Trials`.
+    """
+    parts = []
+    first = 0  # bound with which the next part begins
+    for path in plan.abandoned:
+        cells = cells_of(path)
+        failed = next((k for k in range(first, len(mission.statuses)) if _failed(mission, k)), None)
+        if failed is None or cells[: failed + 2] != cells_of(mission.path[: failed + 2]):
+            continue
+
+        part = _some_bounds(mission, first, failed + 1, mission.statuses[failed])
+        planned = (*mission.path[first : failed + 1], *path[failed + 1 :])
+        parts.append(replace(part, path=planned))
+
+        first = failed + 1
+        is_back = cells_of(mission.path[first + 1 : first + 2]) == (cells[failed],)
+        if is_back and not _failed(mission, first):
+            first += 1
+
+    if first < len(mission.statuses):
+        rest = _some_bounds(mission, first, len(mission.statuses), mission.status)
+        parts.append(_with_planned_path(rest, replace(plan, path=plan.path[first:])))
+    return parts
+
+
+def _failed(mission: Mission, k: int) -> bool:
+    """Return whether a bound of a mission was begun and not completed."""
+    return k < len(mission.statuses) and mission.statuses[k] != "ok"
+
+
+def _some_bounds(mission: Mission, begin: int, end: int, status: str) -> Mission:
+    """Return some bounds of a mission, with the cells that the mission has planned after them."""
+    of_bounds = {name: getattr(mission, name)[begin:end] for name in OF_BOUNDS}
+    return replace(mission, path=mission.path[begin:], status=status, **of_bounds)
 
 
 def _with_planned_path(mission: Mission, plan: Plan) -> Mission:

@@ -101,6 +101,11 @@ def follow(
     return Driven(path, rates, mean, bands, tuple(dict.fromkeys(closed)), trust)
 
 
+def _is_completed(so_far: Mission) -> bool:
+    """Return whether the last bound was completed; then, only the mission has another status."""
+    return so_far.bounds[-1].status == "ok" and so_far.status not in CAUSES
+
+
 def _planned(path: tuple[Station, ...], cell: Cell) -> tuple[Station, ...]:
     """Return the planned path up to a cell."""
     cells = cells_of(path)
@@ -115,9 +120,7 @@ def _planned(path: tuple[Station, ...], cell: Cell) -> tuple[Station, ...]:
 
 def _returned(path: tuple[Station, ...], cell: Cell, so_far: Mission) -> tuple[Station, ...]:
     """Return the path so far, followed by a bound back from the cell that was not reached."""
-    # If a mission stops after a bound that was completed, only the mission has another status.
-    is_completed = so_far.bounds[-1].status == "ok" and so_far.status not in CAUSES
-    possible = cells_of(path[-1:] if is_completed else path[-2:])
+    possible = cells_of(path[-1:] if _is_completed(so_far) else path[-2:])
     if cell not in possible:
         places = " or ".join(map(str, possible))
         raise TrustboError(f"after the bounds so far, the team is in {places}, not in {cell}.")
@@ -171,6 +174,8 @@ def plan_rest(
     rest = choose(policy, state.settings["policy"], rng, draws, planner)
     rest = rest.with_draws(planner.evaluate(rest.path, draws))
     whole = whole_plan(base.problem, driven, rest)
+    if so_far is not None and not _is_completed(so_far):
+        whole = replace(whole, abandoned=(*plan.abandoned, plan.path))
     return with_past_failures(whole, state, planner, so_far), risk
 
 

@@ -73,6 +73,7 @@ class Plan(Summary):
         n_driven: Number of bounds of the path before `path[n_driven]`, the cell in which the team
             was when the mission was replanned; otherwise 0. The way back after a bound that failed
             counts as driven.
+        abandoned: Planned paths of this mission on which a bound failed, before it was replanned.
         value_band: Ends of the 90 % band of the value over the draws, computed with the mean
             failure probability; None with one draw. `value` may lie outside the band, because it
             limits trust to 1.
@@ -101,6 +102,7 @@ class Plan(Summary):
     value_band: tuple[float, float] | None = None
     blocked: tuple[tuple[Cell, ...], ...] = ()
     n_driven: int = 0
+    abandoned: tuple[tuple[Station, ...], ...] = ()
     past_failures: tuple[PastFailure, ...] = ()
 
     def with_draws(self, given: Self) -> Self:
