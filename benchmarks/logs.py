@@ -104,6 +104,10 @@ def main():
     parser = arguments(__doc__, names=("score", "memory"), data=True, quick="use a simulated log")
     parser.add_argument("--window", type=float, nargs="+", default=[20.0, 10.0])
     given = parsed(parser)
+    if given.data is None and not given.quick:
+        print("The log of robots is not read: give --data or set TRUSTBO_DATA (see --help).")
+        return
+
     logs = halves(*(simulated() if given.quick else read_mrclam(given.data / "mrclam")))
     for name, part in (("score", score), ("memory", memory)):
         if name in given.names:

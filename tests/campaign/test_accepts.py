@@ -143,7 +143,7 @@ def written_missions(campaign, folder):
 
 def checked(campaign, folder):
     verdict = tb.check(campaign.posteriors, campaign.missions)
-    assert len(verdict.table) == 4
+    assert len(verdict.table) == 5
 
 
 def compared(campaign, folder):
