@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.state import Posterior, State, why_never_learned
-from trustbo.data import OF_BOUNDS, Mission, cells_of
+from trustbo.data import OF_BOUNDS, Mission, Station, cells_of
 from trustbo.errors import PosteriorError, TrustboError, warn
 from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard
@@ -232,9 +232,11 @@ def _parts(mission: Mission, plan: Plan) -> list[Mission]:
         if is_back and not _failed(mission, first):
             first += 1
 
+    if first == 0:
+        return [_with_planned_path(mission, plan.path)]
     if first < len(mission.statuses):
         rest = _some_bounds(mission, first, len(mission.statuses), mission.status)
-        parts.append(_with_planned_path(rest, replace(plan, path=plan.path[first:])))
+        parts.append(_with_planned_path(rest, plan.path[first:]))
     return parts
 
 
@@ -249,14 +251,14 @@ def _some_bounds(mission: Mission, begin: int, end: int, status: str) -> Mission
     return replace(mission, path=mission.path[begin:], status=status, **of_bounds)
 
 
-def _with_planned_path(mission: Mission, plan: Plan) -> Mission:
+def _with_planned_path(mission: Mission, path: Sequence[Station]) -> Mission:
     """Add the planned cells to the path of a mission that ends where its log ends.
 
     The failure probability of a bound depends on the next move and on the set of posts that the
     plan has for it, which are then known.
     """
     n = len(mission.path)
-    is_begun = all(a[:2] == b[:2] for a, b in zip(plan.path, mission.path, strict=False))
-    if mission.status == "ok" or len(plan.path) <= n or not is_begun:
+    is_begun = all(a[:2] == b[:2] for a, b in zip(path, mission.path, strict=False))
+    if mission.status == "ok" or len(path) <= n or not is_begun:
         return mission
-    return replace(mission, path=(*mission.path[:-1], *plan.path[n - 1 :]))
+    return replace(mission, path=(*mission.path[:-1], *path[n - 1 :]))

@@ -116,10 +116,11 @@ def check(
     mission ahead stands out if it differs from .9 by more than .05 and two standard errors over
     missions, and at least four missions are predicted. It is also computed for new bounds only, in
     which none of the missions before had measured a rate. Intervals there can be too narrow
-    although those on a path that is repeated are not. The verdict
-    also names the checks that the model or the data do not allow: robots and places need the
-    effects of the model, weights a variable `beta` or `B` with the dim `feature`, coverage all
-    posteriors of a campaign, and new bounds also paths. Effects of places in a NumPyro function
+    although those on a path that is repeated are not.
+
+    The verdict also names the checks that the model or the data do not allow: robots and places
+    need the effects of the model, weights a variable `beta` or `B` with the dim `feature`, coverage
+    all posteriors of a campaign, and new bounds also paths. Effects of places in a NumPyro function
     also need a variable `beta0`.
 
     See also `pit` of `tb.inference.score` for the shape of predictions, `tb.compare` for other
