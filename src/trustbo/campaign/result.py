@@ -369,7 +369,7 @@ class Result(Summary):
         - `where`: cells where a bound failed.
         - `failed_bounds`: bounds that were not completed, such as "2 into 1,2 (stuck)".
         - `contact_rate`: mean contact rate.
-        - `objective`: value of the objective that the plan expected, such as minus the contact lost.
+        - `objective`: value that the plan expected, for example minus the contact lost.
         - `n_bounds`: number of bounds run.
         - `n_unmeasured`: number of bounds run in which no contact rate was measured.
         - `path_changed`: whether the plan differs from the previous one.
