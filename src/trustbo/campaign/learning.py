@@ -194,8 +194,8 @@ def missions_of_hazard(
     """Return the measured missions from which the hazard is learned, with their numbers.
 
     The numbers are those of `Result.table`; missions of earlier campaigns have none. A mission in
-    progress comes last. A mission that was replanned after a failure is split; see `_parts`. See
-    `learn_hazard`.
+    progress comes last. A mission that was replanned after a failure has several parts; see
+    `_parts` and `learn_hazard`.
     """
     measured: list[tuple[int | None, Mission]] = [
         (None, mission) for mission in state.earlier.missions if not mission.map

@@ -40,9 +40,9 @@ class FolderLock:
 
         Args:
             path: Folder.
-            turn: Lock of a campaign that other threads use already; by default, a new one.
             take_over: Whether to release the lock of an older campaign of this process, as when a
                 cell of a notebook is run again.
+            turn: Lock of a campaign that other threads use already; by default, a new one.
 
         Raises:
             TrustboError: Another campaign uses the folder, or the folder cannot be written.
