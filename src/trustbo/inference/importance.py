@@ -431,7 +431,8 @@ def _finite(log_p: np.ndarray) -> np.ndarray:
 def smoothed(log_ratio: np.ndarray, relative: float = 1.0) -> tuple[np.ndarray, float, float]:
     """Smooth log importance ratios (point,) with a Pareto tail.
 
-    If no ratio is finite, all weights are equal, and k-hat is infinite.
+    If no ratio is finite, all weights are equal, and k-hat is infinite. If one ratio exceeds the
+    others so far that the tail has no Pareto fit, weights are not smoothed, and k-hat is infinite.
 
     Args:
         log_ratio: Log importance ratios.
@@ -453,7 +454,11 @@ def smoothed(log_ratio: np.ndarray, relative: float = 1.0) -> tuple[np.ndarray, 
     # Vehtari et al. (2024), as implemented in ArviZ, which takes log likelihoods: the sign is the
     # opposite.
     kept = np.where(finite, log_ratio, log_ratio[finite].min() - _BELOW_ALL)
-    log_weight, k_hat = array_stats.psislw(-kept, r_eff=relative)  # pyright: ignore[reportArgumentType]
+    with np.errstate(all="ignore"):  # weights in a very long tail overflow
+        log_weight, k_hat = array_stats.psislw(-kept, r_eff=relative)  # pyright: ignore[reportArgumentType]
+    if np.isnan(log_weight).any():
+        return special.softmax(kept), np.inf, log_mean
+
     k_hat = float(np.nan_to_num(k_hat, nan=np.inf))
     return special.softmax(log_weight), k_hat, log_mean
 
