@@ -6,14 +6,18 @@ if there is no such bound.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import LINE_OF_SIGHT, Cell, Mission
+from trustbo.models.families import FAMILIES
 from trustbo.models.params import Params
 from trustbo.planning import Plan, Planner
 from trustbo.planning.objectives import Weights
+from trustbo.planning.problem import Problem
+from trustbo.planning.recursion import Recursion
 from trustbo.planning.sums import best_sums
 from trustbo.workspace.moves import bounds_along
 
@@ -57,11 +61,19 @@ def line_of_sight(planner: Planner) -> np.ndarray:
 def best_paths(planner: Planner, rates: np.ndarray) -> list[Path]:
     """Best admissible path under each table of rates, (draw, move, row, col), exactly.
 
-    Most contact less the number of bounds; or for the objective `mean`, the largest mean.
+    Most contact less the number of bounds; or for the objective `mean`, the largest mean. If
+    failures have a cost, it is that of trustbo's plans: the cost of a failure times the failure
+    probability of the path, as in `Planner.with_risk`. Rates above 1 then count as 1.
+
+    Raises InfeasibleError if no path respects `max_failure`.
     """
-    paths, n_draws = planner.problem.paths, len(rates)
+    problem = planner.problem
+    if problem.edge_risks is not None:
+        return _best_with_failures(problem, rates)
+
+    paths, n_draws = problem.paths, len(rates)
     n_bounds = np.arange(paths.longest + 1.0)
-    is_mean = planner.problem.objective.name == "mean"
+    is_mean = problem.objective.name == "mean"
     weights = Weights(
         np.ones((n_draws, paths.longest + 1, 1)),
         np.tile(0.0 * n_bounds if is_mean else -n_bounds, (n_draws, 1)),
@@ -69,6 +81,24 @@ def best_paths(planner: Planner, rates: np.ndarray) -> list[Path]:
     )
     gains = np.nan_to_num(rates).reshape(n_draws, 1, -1)
     _, found = best_sums(paths.graph, gains, weights, np.zeros(gains.shape[2]))
+    return [paths.cells(flat) for flat in found]
+
+
+def _best_with_failures(problem: Problem, rates: np.ndarray) -> list[Path]:
+    """Best paths by trustbo's own search, for trust without memory that equals the rates."""
+    paths, n_draws = problem.paths, len(rates)
+    drift = np.nan_to_num(rates)[:, None]
+    if paths.workspace.n_posts > 1:
+        way, row, col, _ = paths.pairs.T
+        drift = drift[..., way, row, col]
+
+    recursion = Recursion(
+        transition=np.zeros((n_draws, 1, 1)),
+        drift=drift,
+        start=np.zeros((n_draws, 1)),
+        noise_sd=np.ones(n_draws),  # matters only for censored rates
+    )
+    _, _, found = replace(problem, likelihood=FAMILIES["gaussian"]).best(recursion)
     return [paths.cells(flat) for flat in found]
 
 

@@ -20,10 +20,10 @@ class RandomPath(PathPolicy):
         return campaign.ask().path
 
     def choose(self, planner: Planner, rng: np.random.Generator) -> Path:
-        """Draw a path."""
+        """Draw a path, at no cost of failures."""
         sight = line_of_sight(planner)
         values = np.where(np.isnan(sight), np.nan, self.scale * rng.random(sight.shape))
-        return best_paths(planner, values[None])[0]
+        return best_paths(planner.with_failure_cost(0.0), values[None])[0]
 
 
 def shortest() -> RandomPath:

@@ -10,6 +10,7 @@ from enumeration import paths_of
 import trustbo as tb
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
+from trustbo.hazard.components import Components
 from trustbo.planning import Planner
 from trustbo.simulation import Degradation, KinematicSimulator, Truth
 from trustbo.workspace.moves import MOVES, bounds_along
@@ -58,6 +59,33 @@ def test_best_paths_are_admissible_and_the_best_under_their_rates(planner, objec
         values = [paths.value(planner, rates_along(table, walk)) for walk in walks]
         assert paths.value(planner, rates_along(table, path)) == pytest.approx(max(values))
     assert len(set(chosen)) > 5
+
+
+def test_best_paths_pay_for_failures_what_plans_pay(planner):
+    """Against enumeration: the most contact less the cost of a failure times its probability."""
+    rng = np.random.default_rng(0)
+    sight = paths.line_of_sight(planner)
+    exists = planner.workspace.difficulty.exists
+    groups = np.where(exists, rng.beta(0.5, 3.0, (2, *exists.shape)), np.nan)
+    mixed = Components(groups, np.array([0.7, 0.3]))  # bounds fail together, not independently
+    free = planner.with_risk(0.7 * groups[0] + 0.3 * groups[1], components=mixed)
+    walks = paths_of(planner)
+
+    chosen = {}
+    for cost in (0.0, 0.5, 6.0):
+        priced = free.with_failure_cost(cost)
+        tables = np.clip(sight + rng.normal(0.0, 0.1, (10, *sight.shape)), 0.0, 1.0)
+        tables[0] = sight
+        for table, path in zip(tables, paths.best_paths(priced, tables), strict=True):
+            values = [
+                paths.value(planner, rates_along(table, walk))
+                - cost * priced.problem.risk.failure(walk)
+                for walk in walks
+            ]
+            assert path in walks
+            assert values[walks.index(path)] == pytest.approx(max(values))
+        chosen[cost] = paths.best_paths(priced, sight[None])[0]
+    assert chosen[0.0] == paths.best_paths(planner, sight[None])[0] != chosen[6.0]
 
 
 def test_line_of_sight_is_the_mean_over_robots_of_the_workspace_s_feature(planner):
