@@ -230,6 +230,19 @@ def as_names(what: str, given: Iterable[str], n: int | None = None) -> Names:
     return tuple(composed(str(name)) for name in names)  # NumPy's strings become Python's
 
 
+def some_of(what: str, given: Iterable[str], known: Sequence[str]) -> list[int]:
+    """Return the positions of given names among known ones, in increasing order.
+
+    Raises TrustboError if a name is unknown or repeated, or if there are no names.
+    """
+    names = as_names(what, given)
+    unknown = [name for name in names if name not in known]
+    if unknown or not names:
+        got = repr(unknown[0]) if unknown else "no names"
+        raise TrustboError(f"{what} must be some of {', '.join(known)}; got {got}.")
+    return [i for i, name in enumerate(known) if name in names]
+
+
 def default_robots(n_robots: int) -> Names:
     """Return default names of robots: r1, r2, ..."""
     return tuple(f"r{i + 1}" for i in range(n_robots))

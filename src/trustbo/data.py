@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from trustbo.arrays import as_names, default_robots, read_labelled, without_rounding
+from trustbo.arrays import as_names, default_robots, read_labelled, some_of, without_rounding
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import (
     TrustboError,
@@ -412,6 +412,30 @@ class Mission(Summary):
                     "them, or use a workspace with these names."
                 )
 
+        return self._selected(robots, features)
+
+    def of_robots(self, names: Iterable[str]) -> Self:
+        """Return the mission with some of its robots only, in the order of this mission.
+
+        Poses keep the lead. What the other robots measured is left out.
+
+        Args:
+            names: Names of the robots, in any order.
+
+        Raises:
+            TrustboError: A name is unknown or repeated, or there are no names.
+
+        Example:
+            >>> mission.of_robots(["r1", "r3"]).robots
+            ('r1', 'r3')
+        """
+        members = some_of("robots", names, self.robots)
+        if len(members) == len(self.robots):
+            return self
+        return self._selected([self.robots[i] for i in members], self.features)
+
+    def _selected(self, robots: Sequence[str], features: Sequence[str]) -> Self:
+        """Return the mission with some of its robots, and with ticks; see `_on_axes`."""
         i = [self.robots.index(name) for name in robots]
         members = [0, *(1 + j for j in i)]  # the lead is first
         return replace(

@@ -1,12 +1,12 @@
 """Robots and teams."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
 
-from trustbo.arrays import as_names, default_robots
+from trustbo.arrays import as_names, default_robots, some_of
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
     TrustboError,
@@ -131,6 +131,18 @@ class Team(Summary):
     def of(cls, team: Self | None) -> Self:
         """Return the team, by default three identical robots; raises TrustboError if not a Team."""
         return cls() if team is None else require_kind("team", team, Team, "give Team(n_robots=3)")
+
+    def of_robots(self, names: Iterable[str]) -> Self:
+        """Return the team with the same lead and some robots of T2, in the order of this team.
+
+        Raises TrustboError if a name is unknown or repeated, or if there are no names.
+        """
+        members = some_of("robots", names, self.names)
+        if len(members) == self.n_robots:
+            return self
+        robots = tuple(self.robots[i] for i in members)
+        known = tuple(self.names[i] for i in members)
+        return replace(self, n_robots=len(members), robots=robots, names=known)
 
     def _rows(self) -> Rows:
         limit = f"{np.rad2deg(self.max_slope):.3g} degrees"

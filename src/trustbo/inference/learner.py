@@ -44,6 +44,7 @@ from trustbo.inference.params import (
     as_fitted,
     in_order_of_features,
     missions_of,
+    names_in,
     prior_mean,
     read_params,
     read_posterior,
@@ -111,11 +112,11 @@ class Learner:
         self, posterior: xr.DataTree, workspace: Workspace | None, *, next_mission: bool = False
     ) -> Draws:
         """Return all draws of a posterior; see `params_of`."""
-        return self.read(posterior, workspace, [next_mission])[0]
+        return self._read_for(posterior, workspace, [next_mission])[0]
 
     def next_mission(self, posterior: xr.DataTree, workspace: Workspace | None) -> NextMission:
         """Return `draws` without and with `next_mission`; the posterior is read once."""
-        expected, drawn = self.read(posterior, workspace, [False, True])
+        expected, drawn = self._read_for(posterior, workspace, [False, True])
         return NextMission(expected, drawn)
 
     def record(self) -> dict[str, Any]:
@@ -145,21 +146,45 @@ class Learner:
         """Return the draws of a posterior for each value of `next_mission`; see `params_of`."""
         return read_params(posterior, workspace, next_mission)
 
+    def _read_for(
+        self, posterior: xr.DataTree, workspace: Workspace | None, next_mission: Sequence[bool]
+    ) -> Sequence[Draws]:
+        """Return what `read` returns, with the robots of the workspace only.
+
+        The draws are read for the whole team, so that their values do not depend on who goes. The
+        posterior may lack robots that stay at home.
+        """
+        if not isinstance(workspace, Workspace) or workspace.within is None:
+            return self.read(posterior, workspace, next_mission)
+
+        names = workspace.team.names
+        known = names_in(posterior, "robot")
+        whole = workspace.within
+        if set(names) <= set(known):
+            whole = whole.of_robots([name for name in whole.team.names if name in known])
+        draws = self.read(posterior, whole, next_mission)
+        return [of_whole.in_order(names, workspace.features) for of_whole in draws]
+
     def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
         """Draw parameters from the prior without effects."""
+        whole = workspace.whole
         model = self.known.for_features(workspace.features)
-        n_robots = workspace.team.n_robots
-        return sample_prior(model, len(workspace.features), n_draws, seed, n_robots=n_robots)
+        sizes = len(workspace.features), n_draws, seed
+        draws = sample_prior(model, *sizes, n_robots=whole.team.n_robots)
+        return _of_going(draws, workspace)
 
     def first_mission(self, n_draws: int, seed: int, workspace: Workspace) -> NextMission:
         """Draw parameters from the prior with the effects of the first mission."""
         model = self.known.for_features(workspace.features)
-        return sample_prior_ahead(model, workspace, n_draws, seed)
+        ahead = sample_prior_ahead(model, workspace.whole, n_draws, seed)
+        return NextMission(*(_of_going(draws, workspace) for draws in ahead))
 
     def prior_mean(self, workspace: Workspace) -> Draws:
         """Return the prior mean."""
+        whole = workspace.whole
         model = self.known.for_features(workspace.features)
-        return prior_mean(model, len(workspace.features), n_robots=workspace.team.n_robots)
+        mean = prior_mean(model, len(workspace.features), n_robots=whole.team.n_robots)
+        return _of_going(mean, workspace)
 
 
 class FunctionLearner(Learner):
@@ -195,15 +220,24 @@ class FunctionLearner(Learner):
 
     def prior_draws(self, n_draws: int, seed: int, workspace: Workspace) -> Draws:
         """See `Learner.prior_draws`."""
-        return prior_draws_of_function(self.model, n_draws, seed, workspace)
+        draws = prior_draws_of_function(self.model, n_draws, seed, workspace.whole)
+        return _of_going(draws, workspace)
 
     def first_mission(self, n_draws: int, seed: int, workspace: Workspace) -> NextMission:
         """See `Learner.first_mission`."""
-        return prior_draws_of_function_ahead(self.model, n_draws, seed, workspace)
+        ahead = prior_draws_of_function_ahead(self.model, n_draws, seed, workspace.whole)
+        return NextMission(*(_of_going(draws, workspace) for draws in ahead))
 
     def prior_mean(self, workspace: Workspace) -> Draws:
         """See `Learner.prior_mean`."""
         return self.prior_draws(_N_MEAN, 0, workspace).mean()
+
+
+def _of_going(draws: Draws, workspace: Workspace) -> Draws:
+    """Return draws for the whole team with the robots of a workspace only."""
+    whole = workspace.whole
+    named = draws.in_order(whole.team.names, whole.features)
+    return named if whole is workspace else named.in_order(workspace.team.names, whole.features)
 
 
 def as_learner(model: Model | FunctionModel) -> Learner:

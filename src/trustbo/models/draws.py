@@ -22,7 +22,7 @@ PLACES = {
 }
 """Axes of the effects of places; the first has one entry, or one for each robot."""
 _AXES = {
-    **dict.fromkeys(("beta0", "b", "delta_w", "delta_v"), ("robot",)),
+    **dict.fromkeys(("beta0", "b", "delta_w", "delta_v", "x0_mean", "x0_sd"), ("robot",)),
     **dict.fromkeys(("B0", "Delta_w", "Delta_v"), ("robot", "robot")),
     "beta": ("robot", "feature"),
     "B": ("feature", "robot", "robot"),
@@ -68,7 +68,17 @@ class OwnDrift(Protocol):
         ...
 
     def require_order(self, own: Order, wanted: Order) -> None:
-        """Raise TrustboError unless the drift is that of robots and features in this order."""
+        """Raise TrustboError unless the drift is that of robots and features in this order.
+
+        Some of the robots may be left out.
+        """
+        ...
+
+    def of_robots(self, which: Sequence[int]) -> Self:
+        """Select some of the robots, by position.
+
+        Raises TrustboError if their drift depends on the other robots.
+        """
         ...
 
 
@@ -131,7 +141,7 @@ class Draws(Summary):
         if self.own is not None:
             return len(self.robots or ())
         if self.place_robot is not None:
-            return self.place_robot.known.shape[1]
+            return self.place_robot.n_robots
         if self.arrays["b"].ndim > 1:
             return self.arrays["b"].shape[1]
         n = max((self.arrays[name].shape[1] for name in PLACES if name in self.arrays), default=1)
@@ -190,7 +200,13 @@ class Draws(Summary):
         """Return the draws with their robots and features in the order of these names.
 
         Draws without names are in this order already. Parameters that all robots share apply to
-        robots with any names. Raises TrustboError if names differ.
+        robots with any names. Robots that are not named are left out; the values of the others do
+        not change. If noise depends on the predicted line of sight (`f_v`), its mean is then that
+        of the robots that are left.
+
+        Raises:
+            TrustboError: The draws lack a robot, the names of the features differ, or robots are
+                left out of a model in which they influence each other.
         """
         wanted = {"robot": tuple(robots), "feature": tuple(features)}
         own = {
@@ -201,6 +217,9 @@ class Draws(Summary):
             self.own.require_order(own, wanted)
 
         order = {axis: _positions(axis, own[axis], names) for axis, names in wanted.items()}
+        if len(wanted["robot"]) < len(own["robot"]):
+            return self._of_robots(order["robot"] or [], own).in_order(robots, features)
+
         order |= {"effect": order["robot"], **dict.fromkeys(("move", "row", "col"))}
         arrays = dict(self.arrays)
         for name, value in self.arrays.items():
@@ -215,6 +234,34 @@ class Draws(Summary):
             in_bounds = in_bounds._replace(known=in_bounds.known[:, order["robot"]])
         names = {"robots": wanted["robot"], "features": wanted["feature"]}
         return self._with(arrays=arrays, place_robot=in_bounds, **names)
+
+    def _of_robots(self, which: Sequence[int], own: Order) -> Self:
+        """Select some of the robots, which are named in `own`, by position."""
+        names = [own["robot"][i] for i in which]
+        if "B0" in self.arrays:
+            raise TrustboError(_influenced("CoupledTrust", own["robot"], names))
+
+        arrays = dict(self.arrays)
+        for name, value in self.arrays.items():
+            axes = _AXES.get(name, ())[1 - value.ndim :] if value.ndim > 1 else ()
+            for i, axis in enumerate(axes, start=-len(axes)):
+                if axis in ("robot", "effect") and value.shape[i] > 1:
+                    arrays[name] = np.take(arrays[name], which, axis=i)
+
+        if "transition" in arrays:
+            space = StateSpace(**{n: v for n, v in arrays.items() if n in StateSpace._fields})
+            if not space.is_uncoupled:
+                raise TrustboError(_influenced("the function", own["robot"], names))
+            kept = space.of_robots(which)._asdict()
+            arrays |= {name: value for name, value in kept.items() if value is not None}
+
+        return self._with(
+            arrays=arrays,
+            own=self.own and self.own.of_robots(which),
+            place_robot=self.place_robot and self.place_robot.of_robots(which),
+            robots=tuple(names),
+            features=tuple(own["feature"]),
+        )
 
     def state_space(self, n_robots: int, *, adds_noise: bool = True) -> StateSpace:
         """Return the model's equation at each draw.
@@ -377,11 +424,22 @@ class NextMission(NamedTuple):
         return self.drawn
 
 
+def _influenced(model: str, robots: Sequence[str], given: Sequence[str]) -> str:
+    """Return a message that some robots cannot be left out of a model."""
+    return (
+        f"in {model}, the trust in a robot depends on the other robots, so all of "
+        f"{', '.join(robots)} must take part, not only {', '.join(given)}; use a model without "
+        "such influence, such as PooledTrust()."
+    )
+
+
 def _positions(axis: str, own: Sequence[str], wanted: Sequence[str]) -> list[int] | None:
     """Return the position of each wanted name; None if they are in order.
 
-    Raises TrustboError if the names differ.
+    Raises TrustboError if the names differ; robots may be left out.
     """
+    if axis == "robot" and len(wanted) < len(own) and set(wanted) <= set(own):
+        return [list(own).index(name) for name in wanted]
     if sorted(own) != sorted(wanted):
         raise TrustboError(
             f"the parameters have the {axis}s {', '.join(own)}, not {', '.join(wanted)}; give "

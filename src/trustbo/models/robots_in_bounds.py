@@ -1,5 +1,6 @@
 """Effects of robots in bounds, which are drawn when they are needed."""
 
+from collections.abc import Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -26,6 +27,7 @@ class RobotsInBounds(NamedTuple):
         scale: Scale g in each bound, shape (move, row, col).
         number: Number of each draw, shape (draw,), which does not change when draws are selected.
         seed: Random seed.
+        members: Positions of the robots that take part, in `known`; None for all robots.
     """
 
     known: np.ndarray
@@ -34,6 +36,17 @@ class RobotsInBounds(NamedTuple):
     scale: np.ndarray
     number: np.ndarray
     seed: int
+    members: np.ndarray | None = None
+
+    @property
+    def n_robots(self) -> int:
+        """Number of robots that take part."""
+        return self.known.shape[1] if self.members is None else len(self.members)
+
+    def of_robots(self, which: Sequence[int]) -> Self:
+        """Select some of the robots, by position; their effects stay as they are."""
+        every = np.arange(self.known.shape[1]) if self.members is None else self.members
+        return self._replace(members=every[list(which)])
 
     def at(self, bounds: np.ndarray) -> np.ndarray:
         """Return the effects (draw, robot, bound) in the given bounds; for move -1, they are 0.
@@ -48,6 +61,8 @@ class RobotsInBounds(NamedTuple):
 
         is_known = column >= 0
         effects[..., is_known] = self.known[..., column[is_known]]
+        if self.members is not None:
+            effects = effects[..., self.members, :]
         return np.where(which[0] < 0, 0.0, effects)
 
     def _elsewhere(self, bound: np.ndarray) -> np.ndarray:

@@ -172,6 +172,11 @@ class Plan(Summary):
         values = {name: self.trust, f"{name}_low": self.bands[0], f"{name}_high": self.bands[-1]}
         return {column: value[:, robots].mean(1) for column, value in values.items()}
 
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """Names of the robots of T2 that take part, in the order of `trust`."""
+        return self.workspace.team.names
+
     @cached_property
     def positions(self) -> np.ndarray:
         """CRS coordinates x and y of the cell centres, shape (cell, 2), in metres."""
@@ -291,9 +296,10 @@ def _when(failures: Sequence[PastFailure]) -> str:
 
 
 def plan_to_record(plan: Plan) -> dict[str, Any]:
-    """Convert a plan, without its workspace, to plain lists and numbers."""
+    """Convert a plan, with its robots but without its workspace, to plain lists and numbers."""
     values = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "workspace"}
     values["risk"] = None if plan.risk is None else plan.risk.to_record()
+    values["robots"] = list(plan.robots)
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else value
         for name, value in values.items()
@@ -301,8 +307,12 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 
 
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
-    """Restore a plan of a workspace from a record made by `plan_to_record`."""
+    """Restore a plan of a workspace from a record made by `plan_to_record`.
+
+    Without the key `robots`, all robots of the workspace take part.
+    """
     values = {name: _as_tuples(value) for name, value in record.items()}
+    workspace = workspace.of_robots(values.pop("robots", workspace.team.names))
     values |= {name: np.array(record[name]) for name in ("trust", "bands")}
     values["risk"] = record["risk"] and PathRisk.from_record(record["risk"])
     values["past_failures"] = tuple(

@@ -104,7 +104,9 @@ def best_trust(
         for m, step in enumerate(STEPS):
             before = np.where(by == n_moves - 1 - m, second, top)  # the reverse move is forbidden
             before = np.roll(before, step, axis=(1, 2))  # only the margin wraps around
-            carried = np.where(np.isneginf(before), before, beta0[:, None, None] * before)
+            with np.errstate(invalid="ignore"):  # 0 times -inf, which is not used
+                kept = beta0[:, None, None] * before
+            carried = np.where(np.isneginf(before), before, kept)
             entered[m] = carried + u[:, m]
         entered[:, :, k > reach] = -np.inf
 

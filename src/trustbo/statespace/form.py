@@ -1,5 +1,6 @@
 """Parameters of the state-space form, and constructors for the paper's equations."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -67,6 +68,28 @@ class StateSpace(NamedTuple):
         """Select points by an index array, a mask or a slice."""
         fields = [None if value is None else value[index] for value in self]
         return type(self)(*fields)
+
+    @property
+    def is_uncoupled(self) -> bool:
+        """Whether the trust in no robot depends on that in others; noise may be shared."""
+        A = np.asarray(self.transition)
+        n = self.n_members
+        return n == 1 or (A.shape[1] == 1 and not A[..., ~np.eye(n, dtype=bool)].any())
+
+    def of_robots(self, which: Sequence[int]) -> Self:
+        """Return the form of some robots, by position, if `is_uncoupled`."""
+        some = list(which)
+        if self.n_members == 1:  # groups are robots, or there is one for all
+            fields = [v if v is None or v.shape[1] == 1 else v[:, some] for v in self]
+            return type(self)(*fields)
+
+        vectors = ("initial_mean", "noise_sd")
+        kept = {}
+        for name, value in self._asdict().items():
+            if value is not None:
+                kept[name] = value[..., some]
+                kept[name] = kept[name] if name in vectors else kept[name][..., some, :]
+        return type(self)(**kept)
 
     def grouped(self, values: Any) -> Any:
         """Rearrange values (..., robot) as (..., group, member)."""

@@ -19,7 +19,9 @@ def map_name(workspace: Workspace) -> str:
     The content consists of the grid, the passable cells, the slope limit and the names of the
     features. With a terrain, the heights, the maps of the features and the model of sight are
     added; teams of different size therefore share a map. Without a terrain, the awareness is added.
+    If robots stay at home, the map is that of the whole team.
     """
+    workspace = workspace.whole
     settings = {
         "grid": asdict(workspace.grid),
         "features": workspace.features,

@@ -24,8 +24,9 @@ choice. Campaigns store line of sight, but not the posts. After a change of the 
 sight that was stored before is that of other posts.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from copy import copy
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy import ndimage
@@ -99,7 +100,7 @@ class Posts:
 
     Attributes:
         grid: Planning grid.
-        team: Lead and overwatching robots.
+        team: Lead and the overwatching robots that take part; see `of_robots`.
         sight: Assumed model of sight.
         surface: Rasters of the terrain.
         routes: Fastest routes over the surface.
@@ -119,6 +120,8 @@ class Posts:
         self.sight = sight
         self.surface = surface
         self.routes = Routes(surface)
+        self._whole = team  # for which stops and posts are chosen
+        self._members: list[int] | None = None  # positions in it; None for all robots
 
         self._standable = largest_region(surface.passable)
         self._safe = self._standable & (surface.slope <= _SAFE * team.max_slope)
@@ -129,6 +132,16 @@ class Posts:
         self._central = self._central_stops(traversability)
         self._stops: dict[Cell, np.ndarray] = {}
         self._posts: dict[tuple[Cell, Cell | None, str], np.ndarray] = {}
+
+    def of_robots(self, names: Iterable[str]) -> Self:
+        """Return the stops, posts and routes of some robots, as planned for the whole team.
+
+        Raises TrustboError if a name is unknown or repeated, or if there are no names.
+        """
+        some = copy(self)  # which shares the stops and posts found so far
+        some.team = self.team.of_robots(names)
+        some._members = [self._whole.names.index(name) for name in some.team.names]
+        return some
 
     # --- routes ---
 
@@ -223,7 +236,7 @@ class Posts:
             return here
 
         aims = (here + _SHARES[:, None, None] * (goals - here)).reshape(-1, 2)
-        seen = self._seen(position[:, None], aims, self.team.lead, self.team.robots[0]).mean(1)
+        seen = self._seen(position[:, None], aims, self.team.lead, self._whole.robots[0]).mean(1)
         return position[np.argmax(seen - _NEARER * np.linalg.norm(position - here, axis=1))]
 
     def _central_stops(self, traversability: np.ndarray | None) -> dict[Cell, np.ndarray]:
@@ -263,12 +276,13 @@ class Posts:
             ahead = list(dict.fromkeys([None, *around, next_cell]))
             for c, posts in zip(ahead, self._choose_posts(cell, ahead, SETS[name]), strict=True):
                 self._posts[cell, c, name] = posts
-        return self._posts[key]
+        posts = self._posts[key]
+        return posts if self._members is None else posts[self._members]
 
     def _choose_posts(self, cell: Cell, ahead: Sequence[Cell | None], aim: PostSet) -> np.ndarray:
         """Choose the posts for each next cell, one robot at a time, (next cell, robot, 2)."""
         here = self.stop(cell)
-        robots = self.team.robots
+        robots = self._whole.robots
 
         position = self._lattice(cell, here, aim.radius)
         gap = aim.gap
@@ -306,7 +320,7 @@ class Posts:
         blocking = np.array([cdist(position, route).min(1) < SPACING for route in routes])
 
         scores = {}
-        for robot in dict.fromkeys(self.team.robots):
+        for robot in dict.fromkeys(self._whole.robots):
             closing = self._seen(stops[:, None], position, lead, robot)
             closing *= (1.0 - aim.watching) / 2.0
             seen = closing[0] + closing[1:]
@@ -322,7 +336,7 @@ class Posts:
 
     def _abreast(self, posts: np.ndarray, direction: np.ndarray) -> None:
         """Sort identical robots from left to right, so that their routes do not cross."""
-        robots = self.team.robots
+        robots = self._whole.robots
 
         to_right = posts @ np.array([direction[1], -direction[0]])
         for robot in dict.fromkeys(robots):
@@ -395,7 +409,7 @@ class Posts:
 
         position = self.surface.centers(row, col)[linked if linked.any() else slice(None)]
         distance = np.linalg.norm(position - here, axis=1)
-        n_robots = len(self.team.robots)
+        n_robots = len(self._whole.robots)
 
         near = np.flatnonzero((distance <= RADIUS) & (distance >= SPACING))
         if len(near) < n_robots:  # few or large pixels
@@ -417,7 +431,7 @@ class Posts:
 
         n_pixels = len(self._pixels_of(cramped[0])[0])
         pixels = "pixel" if n_pixels == 1 else "pixels"
-        robot = self.team.names[max(0, n_pixels - 1)]
+        robot = self._whole.names[max(0, n_pixels - 1)]
         problem = (
             f"cell {cramped[0]} has {n_pixels} passable {pixels}, on which robot {robot!r} has no "
             "room beside the lead"
@@ -441,7 +455,7 @@ class Posts:
 
     def _has_room(self, cell: Cell) -> bool:
         """Return whether a cell has a passable pixel for the lead and for each robot."""
-        return len(self._pixels_of(cell)[0]) > len(self.team.names)
+        return len(self._pixels_of(cell)[0]) > len(self._whole.names)
 
     def _pixels_of(self, cell: Cell) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and columns of a cell's passable pixels, in the largest region if possible.

@@ -1,7 +1,7 @@
 """Workspace with the awareness of every bound and the passability of every cell."""
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -80,6 +80,8 @@ class Workspace(Summary):
         onward: DataArray (robot, move, row, col, next_move), the change of line of sight by the
             next move and by the set of posts that is used there; NaN where there is no such move.
             None with one set of posts, which predicts the mean over the next moves.
+        within: Workspace of the whole team if this one is that of some of its robots (see
+            `of_robots`); None if it is that of the whole team.
 
     Example:
         >>> terrain = tb.terrain.example()
@@ -96,6 +98,7 @@ class Workspace(Summary):
     composites: dict[str, CompositeIndex] = field(default_factory=dict)
     posts: Posts | None = None
     onward: xr.DataArray | None = None
+    within: "Workspace | None" = None
 
     @classmethod
     def from_terrain(
@@ -292,6 +295,56 @@ class Workspace(Summary):
         return f"{low:.2f} to {high:.2f}"
 
     @property
+    def whole(self) -> "Workspace":
+        """Workspace of the whole team, which is this one unless robots stay at home."""
+        return self if self.within is None else self.within
+
+    def of_robots(self, names: Iterable[str]) -> "Workspace":
+        """Return the same ground as seen by some robots of T2, while the others stay at home.
+
+        The robots use the posts that are planned for the whole team. `passable_bounds` and
+        `difficulty` are those of the whole team, too. The failure probability of a bound is
+        therefore that of the whole team, and is too high if the robot that fails most stays at
+        home.
+
+        Args:
+            names: Names of the robots, in any order; the result has the order of the workspace.
+
+        Returns:
+            Workspace with these robots, the same one for the same names. It is this workspace if
+            no robot is left out.
+
+        Raises:
+            TrustboError: A name is unknown or repeated, or there are no names.
+
+        Example:
+            >>> two = workspace.of_robots(["r1", "r3"])
+            >>> two.team.names
+            ('r1', 'r3')
+            >>> plan = tb.Planner(two, (9, 0), (0, 9)).plan(posterior)
+        """
+        team = self.team.of_robots(names)
+        if team is self.team:
+            return self
+
+        if team.names not in self._parts:
+            members = [self.team.names.index(name) for name in team.names]
+            self._parts[team.names] = dataclasses.replace(
+                self,
+                awareness=self.awareness.isel(robot=members),
+                team=team,
+                posts=None if self.posts is None else self.posts.of_robots(team.names),
+                onward=None if self.onward is None else self.onward.isel(robot=members),
+                within=self.whole,
+            )
+        return self._parts[team.names]
+
+    @cached_property
+    def _parts(self) -> "dict[tuple[str, ...], Workspace]":
+        """Results of `of_robots` so far."""
+        return {}
+
+    @property
     def surface(self) -> Surface | None:
         """Rasters used to compute positions, motion and sight; None without a terrain."""
         return None if self.posts is None else self.posts.surface
@@ -309,6 +362,8 @@ class Workspace(Summary):
         and connected by routes within the two cells and half a cell around them. Without a terrain,
         any two neighbouring cells are connected.
         """
+        if self.within is not None:
+            return self.within.passable_bounds
         exists = existing_bounds(self.passable.values)
         if self.posts is not None:
             exists = self.posts.linked_bounds(exists)
@@ -318,6 +373,8 @@ class Workspace(Summary):
     @cached_property
     def difficulty(self) -> Difficulty:
         """Difficulty of the bounds, from the robots' routes; bounds are measured when needed."""
+        if self.within is not None:
+            return self.within.difficulty
         traversability = None
         if self.pixels is not None and TRAVERSABLE in self.pixels:
             traversability = self.pixels[TRAVERSABLE].values
@@ -370,7 +427,7 @@ class Workspace(Summary):
         name = require_choice(f"posts of {what}", station[2], self.post_sets)
         return *locate(tuple(station[:2]), what), name
 
-    def with_threat(self, threat: xr.Dataset | None = None) -> Self:
+    def with_threat(self, threat: xr.Dataset | None = None) -> "Workspace":
         """Return a workspace with the feature `threat`, the exposure of each bound to a threat.
 
         The exposure is 0 far from a threat and 1 at its place, averaged over a threat map. Trust
@@ -388,6 +445,9 @@ class Workspace(Summary):
             >>> workspace = workspace.with_threat()
             >>> campaign = tb.Campaign(workspace, (9, 0), (0, 9))
         """
+        if self.within is not None:
+            return self.within.with_threat(threat).of_robots(self.team.names)
+
         exposure = np.zeros(self.passable_bounds.shape)
         if threat is not None:
             exposure = exposure_of(self.grid, threat)

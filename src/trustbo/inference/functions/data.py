@@ -146,7 +146,11 @@ def observations_of(data: Data) -> Observations:
 
 
 def require_same_order(
-    name: str, own: Mapping[str, Sequence[str]], given: Mapping[str, Sequence[str]]
+    name: str,
+    own: Mapping[str, Sequence[str]],
+    given: Mapping[str, Sequence[str]],
+    *,
+    some: bool = False,
 ) -> None:
     """Raise TrustboError if a function was fitted to other robots or features, or another order.
 
@@ -154,10 +158,13 @@ def require_same_order(
         name: Name of the function.
         own: Names of the robots and features of the fit, by axis.
         given: Names for which the function is to be used, by axis.
+        some: Whether robots may be left out.
     """
     for axis, names in given.items():
         have = own[axis]
-        if tuple(have) != tuple(names):
+        is_some = some and axis == "robot"
+        wanted = [robot for robot in have if robot in names] if is_some else have
+        if tuple(wanted) != tuple(names):
             raise TrustboError(
                 f"the function {name} was fitted to missions with the {axis}s {', '.join(have)}, "
                 f"not {', '.join(names)}. A function reads them by position, so give the same "

@@ -1,6 +1,6 @@
 """Draws of a model that is a NumPyro function."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -29,6 +29,8 @@ _SEED = 20261126
 """Seed for the variables of single missions, which are drawn for the next mission."""
 _SAME = 1e-9
 """Largest difference, relative to the largest input, of inputs that should be equal."""
+_FEW = 8
+"""Number of invented bounds on which `FunctionDrift.of_robots` compares drifts."""
 N_CHECKED = 2
 """Number of draws for which `require_plannable` runs the function."""
 
@@ -46,6 +48,7 @@ class FunctionDrift:
         number: Number of each draw, shape (draw,), from which the variables of single missions are
             drawn.
         of_mean: Whether the drift is averaged over all draws.
+        members: Positions of the robots that take part, among `robots`; None for all robots.
     """
 
     model: FunctionModel
@@ -55,10 +58,11 @@ class FunctionDrift:
     shape: tuple[int, int] | None
     number: np.ndarray
     of_mean: bool = False
+    members: tuple[int, ...] | None = None
 
     @property
     def n_robots(self) -> int:
-        """Number of robots."""
+        """Number of robots that the function knows."""
         return len(self.robots)
 
     def space(self) -> StateSpace:
@@ -82,7 +86,7 @@ class FunctionDrift:
 
         known = ~np.isnan(z).any((1, 2))
         found = self._of_bounds("drift", z[known], bounds[known])
-        drift = np.full((len(found), self.n_robots, len(z)), np.nan)
+        drift = np.full((len(found), z.shape[1], len(z)), np.nan)
         drift[..., known] = found
         return drift.reshape(*drift.shape[:2], *shape)
 
@@ -95,6 +99,13 @@ class FunctionDrift:
 
         `z` has the shape (bound, robot, feature).
         """
+        if self.members is not None:
+            # Only the scale of the noise may depend on the other robots, by a mean over robots.
+            filled = np.repeat(z.mean(1, keepdims=True), self.n_robots, axis=1)
+            filled[:, list(self.members)] = z
+            everyone = replace(self, members=None)
+            return everyone._of_bounds(field, filled, bounds)[:, list(self.members)]
+
         data = self._data(z, bounds)
         n_draws = len(self.number)
         size = min(BATCH, max(1, _NUMBERS // data["awareness"][..., 0].size))
@@ -237,7 +248,33 @@ class FunctionDrift:
 
     def require_order(self, own: Order, wanted: Order) -> None:
         """See `OwnDrift.require_order`; a function reads robots and features by position."""
-        require_same_order(self.model.name, own, wanted)
+        require_same_order(self.model.name, own, wanted, some=True)
+
+    def of_robots(self, which: Sequence[int]) -> Self:
+        """See `OwnDrift.of_robots`; the drift is computed with others in the other robots' place.
+
+        Two such computations must agree.
+        """
+        every = range(self.n_robots) if self.members is None else self.members
+        members = tuple(every[i] for i in which)
+        others = [i for i in range(self.n_robots) if i not in members]
+
+        some = replace(self._some(slice(N_CHECKED)), of_mean=False, members=None)
+        rng = np.random.default_rng(0)
+        z = rng.random((_FEW, self.n_robots, len(self.features)))
+        changed = z.copy()
+        changed[:, others] = 1.0 - z[:, others]
+
+        nowhere = np.full((_FEW, 3), -1)
+        pair = [some._of_bounds("drift", a, nowhere)[:, list(members)] for a in (z, changed)]
+        if not np.allclose(*pair, rtol=_SAME, atol=_SAME):
+            names = ", ".join(self.robots[i] for i in members)
+            raise TrustboError(
+                f"in {self.model.in_short()}, the trust in a robot depends on the awareness of "
+                f"other robots, so all of {', '.join(self.robots)} must take part, not only "
+                f"{names}; use a function without such influence."
+            )
+        return replace(self, members=members)
 
 
 def function_drift(
