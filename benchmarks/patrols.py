@@ -1,0 +1,524 @@
+"""Compare the contact that methods lose if every mission has another course on the same ground.
+
+    python benchmarks/patrols.py --data DIR --out out/patrols --csv out/patrols.csv
+    python benchmarks/patrols.py --method "running mean, priced" --jobs 1 --out out/patrols
+    python benchmarks/patrols.py --rows benchmarks/reference/patrols.csv
+
+A campaign of a method has 15 missions in one world, each from another start to another goal. A
+world has three sets of such courses, which are drawn by the name of its terrain. Worlds on one
+terrain have the same courses unless one of them cannot be driven. Missions have the same seeds in
+all methods. The excess of a mission is the expected contact that its path loses, in bounds, minus
+that of the best path of the course, by the truth of the world. Bounds that fail or are not reached
+count as lost.
+
+All methods pay the same for failures: a failure costs as many bounds as the shortest path of the
+course has, times the failure probability by `fit_hazard` on the missions so far. In the methods
+named `priced`, this is so from the first mission on. In those named `free first`, failures have no
+cost until one has happened. The baselines do not use a posterior of trust, and none is fitted. The
+residual process and the running mean plan with their means.
+
+Each campaign has a file in --out, so a run that was stopped continues where it was. With `--rows`,
+no campaign is run, and the tables are those of the rows of earlier runs.
+"""
+
+import sys
+import time
+import warnings
+from argparse import Namespace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from baselines import line_of_sight, residual_process, running_mean
+from baselines.paths import PathPolicy
+from common import Table, arguments, parsed, verdict
+from groups import GROUPS, KINDS, clustered, grounds_of, interval
+from joblib import Parallel, delayed, parallel_config
+from lost import lost_in
+from threadpoolctl import threadpool_limits
+from world_set import World, worlds
+from world_set.world import drawn
+
+import trustbo as tb
+from trustbo.campaign.choose import informed_planner
+from trustbo.data import Cell, Mission
+from trustbo.errors import PosteriorError, TrustboError
+from trustbo.files import write_text
+from trustbo.hazard import BoundRisk, fit_hazard
+from trustbo.models.draws import Draws
+from trustbo.planning import Plan, Planner
+from trustbo.planning.policies import POLICIES, choose_plan
+from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
+from trustbo.workspace import Workspace
+
+SETS = (0, 1, 2)
+MISSIONS = 15
+LATE = 8
+"""First of the missions of which tables show the mean apart."""
+APART = 6
+"""Smallest number of rows or columns, whichever is larger, between a start and a goal."""
+PLANNER = {"max_bounds": "shortest+4"}
+HOPELESS = 0.9
+"""Failure probability above which baselines take the safest path, as campaigns do."""
+_MOST_DRAWS = 100_000
+"""Number of courses that are drawn before a world counts as having too few."""
+_DECIMALS = 5
+
+Course = tuple[Cell, Cell]
+"""Start and goal."""
+
+
+@dataclass(frozen=True)
+class Priced:
+    """Policy of a campaign that pays the price of failures of this benchmark.
+
+    Attributes:
+        policy: Name of the policy that chooses the path.
+        from_start: Whether failures have a cost before the first one has happened.
+    """
+
+    policy: str
+    from_start: bool
+
+    def __call__(
+        self,
+        rng: np.random.Generator,
+        params: Draws,
+        planner: Planner,
+        driven: Sequence[Sequence[Cell]] = (),
+    ) -> Plan:
+        """Plan the next mission."""
+        planner = with_price(planner, self.from_start)
+        return choose_plan(POLICIES[self.policy], rng, params, planner, driven)
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Baseline that plans with a planner of each course.
+
+    Attributes:
+        make: Makes the policy before the first mission.
+        from_start: Whether failures have a cost before the first one has happened.
+    """
+
+    make: Callable[[], PathPolicy]
+    from_start: bool
+
+
+METHODS: dict[str, Priced | Baseline] = {
+    "trustbo, free first": Priced("greedy", from_start=False),
+    "trustbo, priced": Priced("greedy", from_start=True),
+    "trustbo, explore": Priced("explore", from_start=True),
+    "running mean, free first": Baseline(running_mean.greedy, from_start=False),
+    "running mean, priced": Baseline(running_mean.greedy, from_start=True),
+    "residual process, free first": Baseline(residual_process.ResidualProcess, from_start=False),
+    "residual process, priced": Baseline(residual_process.ResidualProcess, from_start=True),
+    "line of sight, free first": Baseline(line_of_sight.LineOfSight, from_start=False),
+    "line of sight, priced": Baseline(line_of_sight.LineOfSight, from_start=True),
+}
+BASELINES = tuple(name for name, method in METHODS.items() if isinstance(method, Baseline))
+OURS = tuple(name for name, method in METHODS.items() if isinstance(method, Priced))
+RIGHT = "all but wrong slope limits"
+"""Group for which the target is stated."""
+TARGET, LEVEL, WORSE = -0.04, 0.02, 0.01
+"""Largest difference from the best baseline, its p-value, and largest difference in a group."""
+
+
+# --- campaigns ---
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """World in which campaigns run: its workspace, its simulator and their truth."""
+
+    world: World
+    workspace: Workspace
+    simulator: KinematicSimulator | RadioSimulator
+    truth: Truth
+
+
+def ground_of(world: World, truths: Path | None) -> Ground:
+    """Make the workspace, simulator and truth of a world; `truths` is the folder of truths."""
+    workspace = world.workspace(n_posts=1)  # truths do not know other sets of posts
+    simulator = world.simulator(workspace)
+    truth = Truth.from_simulator(simulator, folder=truths)
+    return Ground(world, workspace, simulator, truth)
+
+
+def courses(ground: Ground, which: int, n: int = MISSIONS, apart: int = APART) -> list[Course]:
+    """Draw the courses of a set, one for each mission.
+
+    Start and goal are at least `apart` rows or columns from each other. In the assumed workspace,
+    both are passable, and a path leads from one to the other. In the truth, a best path exists. The
+    first courses of a set do not depend on `n`.
+
+    Raises TrustboError if the world has too few courses.
+    """
+    rows, cols = ground.workspace.passable.shape
+    rng = drawn(ground.world.ground, f"courses {which}")
+    found: list[Course] = []
+    for _ in range(_MOST_DRAWS):
+        if len(found) == n:
+            return found
+
+        start, goal = ((int(row), int(col)) for row, col in rng.integers((rows, cols), size=(2, 2)))
+        is_far = max(abs(start[0] - goal[0]), abs(start[1] - goal[1])) >= apart
+        if is_far and _is_drivable(ground, (start, goal), len(found)):
+            found.append((start, goal))
+    raise TrustboError(f"world {ground.world.name!r} has too few courses of {apart} cells.")
+
+
+def _is_drivable(ground: Ground, course: Course, mission: int) -> bool:
+    """Return whether a course has admissible paths, and a best one of known contact."""
+    try:
+        Planner(ground.workspace, *course, **PLANNER)
+        truth = ground.truth.at(mission)
+        return bool(np.isfinite(truth.lost_or_failed(_best(truth, course))))
+    except TrustboError:
+        return False
+
+
+def _best(truth: Truth, course: Course) -> tuple[Cell, ...]:
+    """Return the path that loses least, with failures."""
+    return truth.best(*course, max_bounds=PLANNER["max_bounds"], failures=True)
+
+
+def with_price(planner: Planner, from_start: bool) -> Planner:
+    """Make a failure cost the bounds of a shortest path; if not `from_start`, after the first."""
+    risk = planner.problem.risk
+    has_failures = isinstance(risk, BoundRisk) and risk.has_failures
+    shortest = planner.problem.paths.shortest
+    return planner.with_failure_cost(float(shortest) if from_start or has_failures else 0.0)
+
+
+def seed_of(which: int, mission: int) -> int:
+    """Return the seed with which a mission is simulated, counted from 0, in all methods."""
+    return int(np.random.SeedSequence([which, mission]).generate_state(1)[0])
+
+
+def campaign_of(ground: Ground, which: int, name: str, on: Sequence[Course]) -> pd.DataFrame:
+    """Run a campaign of a method on the courses `on` of a set; return a row for each mission."""
+    method = METHODS[name]
+    begin = _trustbo if isinstance(method, Priced) else _baseline
+    proposals = begin(ground, which, method)
+    next(proposals)
+
+    rows = []
+    for k, course in enumerate(on):
+        path, p_arrive = proposals.send(course)
+        mission = ground.simulator.run(path, seed=seed_of(which, k), mission=k)
+        proposals.send(mission)
+
+        truth = ground.truth.at(k)
+        best = truth.lost_or_failed(_best(truth, course))
+        rows.append({
+            "world": ground.world.name, "kind": ground.world.kind, "case": ground.world.case,
+            "set": which, "method": name, "mission": k + 1,
+            "lost": lost_in(mission), "status": mission.status,
+            "excess": truth.lost_or_failed(path) - best, "best": best, "p_arrive": p_arrive,
+        })  # fmt: skip
+    return pd.DataFrame(rows).round(_DECIMALS)
+
+
+def _trustbo(ground: Ground, which: int, method: Priced) -> Iterator:
+    """Run a campaign of trustbo: send a course to get its path, then the mission on this path."""
+    campaign = tb.Campaign(
+        ground.workspace, policy=method, planner=PLANNER, seed=which, progress=False
+    )
+    course = yield
+    while True:
+        plan = _asked(campaign, course)
+        mission = yield plan.path, plan.p_arrive
+        campaign.tell(mission, again=True)  # robots may get stuck in the same way twice
+        course = yield
+
+
+def _asked(campaign: tb.Campaign, course: Course) -> Plan:
+    """Ask a campaign for a plan of a course."""
+    return campaign.ask(start=course[0], goal=course[1])
+
+
+def _baseline(ground: Ground, which: int, method: Baseline) -> Iterator:
+    """Run a campaign of a baseline: send a course to get its path, then the mission on it."""
+    policy = method.make()
+    missions: list[Mission] = []
+    hazard = fit_hazard([], ground.workspace)
+    course = yield
+    while True:
+        risk = BoundRisk(hazard, ground.workspace)
+        planner = informed_planner(Planner(ground.workspace, *course, **PLANNER), risk)
+        planner = with_price(planner, method.from_start)
+        path = policy.best(planner)
+        if planner.problem.cost_of_failure and risk.failure(path) > HOPELESS:
+            path, _ = planner.problem.safest()
+
+        mission = yield path, risk.along(path).p_arrive
+        missions.append(mission)
+        policy.learn(None, mission)  # pyright: ignore[reportArgumentType] (used by no baseline)
+        try:
+            hazard = fit_hazard(missions, ground.workspace, seed=seed_of(which, len(missions)))
+        except PosteriorError:  # the previous hazard remains, as in a campaign
+            pass
+        course = yield
+
+
+# --- runs ---
+
+
+def file_of(folder: Path, world: str, which: int, method: str) -> Path:
+    """Return the file of the rows of a campaign."""
+    return folder / world / f"{which} {method}.csv".replace(", ", "-").replace(" ", "_")
+
+
+def run_world(
+    world: World,
+    methods: Sequence[str],
+    folder: Path,
+    truths: Path | None,
+    sets: Sequence[int] = SETS,
+    n_missions: int = MISSIONS,
+    apart: int = APART,
+) -> int:
+    """Run the campaigns of a world that have no file yet; return how many."""
+    files = {(which, name): file_of(folder, world.name, which, name)
+             for which in sets for name in methods}  # fmt: skip
+    missing = {key: file for key, file in files.items() if not file.exists()}
+    if not missing:
+        return 0
+
+    with warnings.catch_warnings(), threadpool_limits(1):
+        warnings.simplefilter("ignore")  # of risk, and of bounds without contact
+        ground = ground_of(world, truths)
+        on = {which: courses(ground, which, n_missions, apart) for which, _ in missing}
+        for (which, name), file in missing.items():
+            began = time.process_time()
+            rows = campaign_of(ground, which, name, on[which])
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_text(file, rows.to_csv(index=False))
+            seconds = time.process_time() - began
+            print(f"  {world.name}, {which}, {name}: {seconds:.1f} s", file=sys.stderr, flush=True)
+    return len(missing)
+
+
+def rows_in(folder: Path, names: Sequence[str]) -> pd.DataFrame:
+    """Read the rows of all campaigns in a folder, in the order of worlds, sets and methods."""
+    order = {method: k for k, method in enumerate(METHODS)}
+    tables = []
+    for name in names:
+        for file in sorted((folder / name).glob("*.csv")):
+            tables.append(pd.read_csv(file))
+    rows = pd.concat(tables, ignore_index=True)
+    rank = rows.assign(world=rows["world"].map(list(names).index), method=rows["method"].map(order))
+    rank = rank.sort_values(["world", "set", "method", "mission"], kind="stable")
+    return rows.loc[rank.index].reset_index(drop=True)
+
+
+def run(given: Namespace) -> pd.DataFrame:
+    """Run the campaigns that the arguments of the command line ask for; return all rows."""
+    every = worlds(given.data)
+    some = [w for w in every.values() if given.data or w.is_packaged]
+    if given.world:
+        some = [world for world in some if world.name in given.world]
+    sets, n_missions = given.set or SETS, given.missions
+    if given.quick:
+        some, sets, n_missions = some[:3], sets[:1], 2
+
+    shared = given.method or tuple(METHODS), given.out, given.truths, sets, n_missions
+    with parallel_config("loky", inner_max_num_threads=1):
+        jobs = Parallel(given.jobs, return_as="generator_unordered")(
+            delayed(_try)(world, *shared) for world in some
+        )
+        errors = list(_reported(jobs, len(some)))
+    if errors:
+        raise SystemExit("\n".join(["campaigns are missing:", *errors]))
+    return rows_in(given.out, [world.name for world in some])
+
+
+def _try(world: World, *arguments: Any) -> tuple[int, str]:
+    """Call `run_world`; an error in one world, which is returned, does not stop the others."""
+    try:
+        return run_world(world, *arguments), ""
+    except Exception as error:
+        return 0, f"{world.name}: {type(error).__name__}: {error}"
+
+
+def _reported(jobs: Iterable[tuple[int, str]], n_worlds: int) -> Iterator[str]:
+    """Print the progress and the estimated end after each world; yield the errors."""
+    began = time.time()
+    n_run = 0  # worlds of which some campaign had no file
+    for k, (n_campaigns, error) in enumerate(jobs, start=1):
+        if error:
+            print(error, file=sys.stderr, flush=True)
+            yield error
+        if not n_campaigns:
+            continue
+
+        n_run += 1
+        passed = time.time() - began
+        end = time.localtime(time.time() + passed / n_run * (n_worlds - k))
+        state = f"{k} of {n_worlds} worlds after {passed / 60.0:.0f} min"
+        print(f"{state}, end at about {time.strftime('%H:%M', end)}", file=sys.stderr, flush=True)
+
+
+# --- tables ---
+
+
+def groups_of(rows: pd.DataFrame) -> dict[str, pd.Series]:
+    """Return for each group and kind which rows belong to it; limits too high and low apart."""
+    is_limit, is_low = rows["kind"] == "limit", rows["case"].str.contains("low")
+    groups = {name: rows["kind"].isin(kinds) for name, kinds in GROUPS.items()}
+    groups |= {"limit too high": is_limit & ~is_low, "limit too low": is_limit & is_low}
+    groups |= {kind: rows["kind"] == kind for kind in KINDS[:-1]}
+    return {name: chosen for name, chosen in groups.items() if chosen.any()}
+
+
+def of_worlds(rows: pd.DataFrame, quantity: str = "excess") -> pd.DataFrame:
+    """Compute the mean of a quantity by world, with a column for each method.
+
+    Only sets and missions that all methods have are used.
+    """
+    index = ["world", "kind", "case", "set", "mission"]
+    wide = rows.pivot_table(quantity, index, "method").dropna()
+    wide = wide[[name for name in METHODS if name in wide]]
+    return wide.groupby(level=["world", "kind", "case"]).mean().reset_index()
+
+
+def late(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows of the missions from `LATE` on."""
+    return rows[rows["mission"] >= LATE]
+
+
+def tests(excess: pd.DataFrame, ours: str) -> pd.DataFrame:
+    """Test the difference of a method from each baseline, and from the best one of each group.
+
+    Args:
+        excess: Table of `of_worlds`.
+        ours: The method.
+
+    Returns:
+        Table with columns group, n (worlds), other, `value`, `low`, `high` and `p` of `clustered`,
+        by terrain, and the numbers of worlds in which the method is `better` and `worse` by more
+        than .01 bounds.
+    """
+    others = [name for name in BASELINES if name in excess]
+    table = []
+    for group, chosen in groups_of(excess).items():
+        some = excess[chosen]
+        best = some[others].mean().idxmin()
+        for other, name in [*((o, o) for o in others), (best, f"the best ({best})")]:
+            less = (some[ours] - some[other]).to_numpy()
+            found = clustered(less, grounds_of(some["world"]))
+            counts = int((less < -WORSE).sum()), int((less > WORSE).sum())
+            table.append([group, len(some), name, *found, *counts])
+    head = ["group", "n", "other", "value", "low", "high", "p", "better", "worse"]
+    return pd.DataFrame(table, columns=head)
+
+
+def report(rows: pd.DataFrame) -> None:
+    """Print all tables."""
+    n_missions = rows["mission"].max()
+    whole = {f"missions 1 to {n_missions}": rows, f"missions {LATE} to {n_missions}": late(rows)}
+    for when, some in whole.items():
+        if len(some):
+            print(f"\n**Excess, {when}**: bounds per mission, with failures\n")
+            print_means(of_worlds(some))
+
+    present = set(rows["method"])
+    for ours in OURS:
+        if ours not in present or not present & set(BASELINES):
+            continue
+        for when, some in whole.items():
+            if len(some):
+                print(f"\n**{ours}, minus baselines, {when}** [95 %, t test by terrain]\n")
+                found = tests(of_worlds(some), ours)
+                print_tests(found)
+                print_targets(found)
+
+    ok = rows.assign(arrived=(rows["status"] == "ok").astype(float))
+    first = ok[ok["mission"] == 1]
+    print("\n**First missions that arrive**\n")
+    print_means(of_worlds(first, "arrived"), 2)
+    print("\n**Predicted arrival of first missions**\n")
+    print_means(of_worlds(first, "p_arrive"), 2)
+    print("\n**Missions that arrive**\n")
+    print_means(of_worlds(ok, "arrived"), 2)
+
+    pair = ["trustbo, explore", "trustbo, priced"]
+    if present.issuperset(pair):
+        print("\n**explore minus greedy**: excess in bounds per mission\n")
+        print_pair(rows[rows["method"].isin(pair)], *pair)
+
+
+def print_means(table: pd.DataFrame, places: int = 3) -> None:
+    """Print the means of a table of `of_worlds` by group and kind."""
+    methods = [name for name in METHODS if name in table]
+    printed = Table("group (worlds)", *methods)
+    for group, chosen in groups_of(table).items():
+        means = [f"{mean:z.{places}f}" for mean in table[chosen][methods].mean()]
+        printed.row(f"{group} ({chosen.sum()})", *means)
+
+
+def print_tests(found: pd.DataFrame) -> None:
+    """Print the table of `tests`."""
+    printed = Table("group (worlds)", "baseline", "difference [95 %]", "p", "better", "worse")
+    for _, row in found.iterrows():
+        what = f"{row['group']} ({row['n']})"
+        counts = row["better"], row["worse"]
+        printed.row(what, row["other"], interval(row, 3), f"{row['p']:.2g}", *counts)
+
+
+def print_targets(found: pd.DataFrame) -> None:
+    """Print whether the targets are met, by the table of `tests`."""
+    best = found[found["other"].str.startswith("the best")].set_index("group")
+    if RIGHT in best.index:
+        value, p = best.loc[RIGHT, ["value", "p"]]
+        met = verdict(value <= TARGET and p < LEVEL)
+        print(
+            f"\nAt most {TARGET} from the best baseline, p < {LEVEL}: {met} ({value:.3f}, {p:.2g})"
+        )
+
+    of_groups = best[best.index.isin(GROUPS)]
+    worse = of_groups.index[of_groups["value"] > WORSE].tolist()
+    print(f"No group worse by more than {WORSE}: {verdict(not worse)} {', '.join(worse)}")
+
+
+def print_pair(rows: pd.DataFrame, ours: str, other: str) -> None:
+    """Print the mean differences of two methods by group and kind."""
+    printed = Table("group (worlds)", "difference [95 %]", "p")
+    table = of_worlds(rows)
+    for group, chosen in groups_of(table).items():
+        some = table[chosen]
+        less = (some[ours] - some[other]).to_numpy()
+        value, low, high, p = clustered(less, grounds_of(some["world"]))
+        row = pd.Series({"value": value, "low": low, "high": high})
+        printed.row(f"{group} ({len(some)})", interval(row, 3), f"{p:.2g}")
+
+
+def main() -> None:
+    parser = arguments(
+        __doc__ or "", data=True, out="out/patrols", quick="three worlds, 2 missions"
+    )
+    parser.add_argument("--method", action="append", choices=METHODS, help="default all")
+    parser.add_argument("--world", action="append", help="name of a world, default all")
+    parser.add_argument("--set", action="append", type=int, help="set of courses, default 0, 1, 2")
+    parser.add_argument("--missions", type=int, default=MISSIONS, help=f"default {MISSIONS}")
+    parser.add_argument("--truths", type=Path, default=Path("out/truths"), help="folder of truths")
+    parser.add_argument("--jobs", type=int, default=-1, help="processes, default one per core")
+    parser.add_argument("--csv", type=Path, help="CSV file for the rows")
+    parser.add_argument("--rows", type=Path, action="append", help="CSV file with rows")
+    given = parsed(parser)
+
+    if given.rows:
+        rows = pd.concat([pd.read_csv(file) for file in given.rows], ignore_index=True)
+    else:
+        rows = run(given)
+    if given.csv is not None:
+        write_text(given.csv, rows.to_csv(index=False))
+    report(rows)
+
+
+if __name__ == "__main__":
+    main()
