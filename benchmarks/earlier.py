@@ -82,7 +82,7 @@ def without_places(result: Any) -> Any:
         for entry in result.state.entries
     )
     state = replace(result.state, entries=entries)
-    return tb.campaign.Result(result.workspace, state, result.learner, result._base)
+    return tb.campaign.Result(result.workspace, state, result.learner)
 
 
 Options = Callable[[Any, Any], dict[str, Any]]

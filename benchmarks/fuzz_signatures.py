@@ -652,7 +652,7 @@ def of_export() -> list[Call]:
 
 def of_plots() -> list[Call]:
     r, p = result(), tb.plots
-    shown = {"plan": r.plan, "maps": r.maps(n_draws=5), "history": r.history}
+    shown = {"plan": r.plan(), "maps": r.maps(n_draws=5), "history": r.history}
     values = {
         "values": r.trust_map,
         "workspace": cells(),

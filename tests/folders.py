@@ -13,7 +13,7 @@ def numbers(result):
     """All numbers of a result by name."""
     found = {
         "path": np.array(result.path),
-        "trust": result.plan.trust,
+        "trust": result.plan().trust,
         "map": result.trust_map.values,
     }
     for name, column in result.history.data_vars.items():

@@ -76,7 +76,7 @@ def campaign(options: dict, *, sampler: str, n_iterations: int) -> dict:
         "recommended": [list(cell) for cell in result.path],
         "trust_map": np.nan_to_num(history["trust_map"].values, nan=-9.0).tolist(),
         "final": np.nan_to_num(result.trust_map.values, nan=-9.0).tolist(),
-        "value": float(result.plan.value),
+        "value": float(result.plan().value),
     }
     found |= {name: history[name].values.tolist() for name in ("objective", "contact_rate")}
     for group in ("posterior", "latent", "log_likelihood", "posterior_predictive"):

@@ -62,7 +62,7 @@ def test_a_resumed_campaign_equals_one_that_was_not_interrupted(campaign, flags,
     assert call("resume", tmp_path / "two", "--missions", 2, "--quiet") == 0
     one, two = tb.load_result(campaign), tb.load_result(tmp_path / "two")
     assert one.path == two.path
-    assert one.plan.value == two.plan.value
+    assert one.plan().value == two.plan().value
 
 
 def test_an_existing_campaign_is_replaced_only_if_asked_to(campaign, flags, capsys):

@@ -103,7 +103,7 @@ class Prepared:
 
     @functools.cached_property
     def plan(self):
-        return self.result.plan
+        return self.result.plan()
 
     @functools.cached_property
     def planner(self):

@@ -34,8 +34,8 @@ def test_a_campaign_learns_equations_3_and_4_by_nuts_and_plans_by_equation_6(wor
     assert posterior.attrs["sampler"] == "nuts"
     assert set(posterior["posterior"].data_vars) == {"beta0", "beta", "b", "delta_w", "delta_v"}
     assert not {"places", "robots"} & set(posterior.children)
-    trust = result.plan.trust[-1]  # of each robot, at the goal
-    assert result.plan.value == pytest.approx(expit(np.mean(trust)), rel=1e-6)
+    trust = result.plan().trust[-1]  # of each robot, at the goal
+    assert result.plan().value == pytest.approx(expit(np.mean(trust)), rel=1e-6)
 
 
 def test_the_first_path_is_of_one_draw_of_the_prior(workspace):
@@ -76,5 +76,5 @@ def test_a_campaign_of_the_paper_is_resumed_without_its_model(workspace, tmp_pat
     resumed = tb.resume(tmp_path, n_iterations=2, progress=False)
     assert resumed.model.priors.describe() == settings["model"].priors.describe()
     assert resumed.settings["objective"] == "mean"
-    trust = resumed.plan.trust
-    assert resumed.plan.value == pytest.approx(float(np.mean(trust)), rel=1e-6)
+    trust = resumed.plan().trust
+    assert resumed.plan().value == pytest.approx(float(np.mean(trust)), rel=1e-6)

@@ -95,7 +95,7 @@ def figures() -> Iterator[Figure]:
         "not know of the scrub and of the damage; from mission 3, predictions agree.",
     )  # fmt: skip
     yield Figure(
-        "trustbo.plots.plan_map", lambda: plots.plan_map(result.plan, bounds=[1, 2]),
+        "trustbo.plots.plan_map", lambda: plots.plan_map(result.plan(), bounds=[1, 2]),
         "The path with its overwatch points, and routes and sight lines of two bounds.", wide=True,
     )  # fmt: skip
     yield Figure(
@@ -126,7 +126,7 @@ def figures() -> Iterator[Figure]:
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.explore",
-        lambda: plots.explore(result.plan, result.maps(), result.history), "",
+        lambda: plots.explore(result.plan(), result.maps(), result.history), "",
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from arviz_stats.summary import summary
 
 from trustbo import plots
 from trustbo.campaign.result import Result
+from trustbo.data import path_text
 from trustbo.display import render
 from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
@@ -42,8 +43,8 @@ _OF_BOUNDS = {
     "begun": "driven",
 }
 """Headings of the table of bounds, keyed by the columns of `bounds_of`."""
-_OF_MISSIONS = ("status", "failed_bounds", "plan", "contact_rate", "contact_lost", "objective",
-                "n_bounds", "n_unmeasured")  # fmt: skip
+_OF_MISSIONS = ("start", "goal", "robots", "status", "failed_bounds", "plan", "contact_rate",
+                "contact_lost", "lost_share", "objective", "n_bounds", "n_unmeasured")  # fmt: skip
 """Columns of the table of missions, if they have values."""
 _DIAGNOSTICS = {
     "k_hat": "Pareto k-hat (at most 0.7, good below 0.5)",
@@ -90,7 +91,7 @@ def write_report(path: FilePath, result: Result) -> None:
 
 def facts_of(result: Result) -> dict[str, str]:
     """Return the facts, by name, that are needed to decide whether to drive the path."""
-    plan = result.plan
+    plan = result.plan()
     path = bounds_of(result)
     bounds = path.iloc[1:]
     rate = float(result.history["contact_rate"][-1])
@@ -120,10 +121,11 @@ def facts_of(result: Result) -> dict[str, str]:
         value += f"; includes a cost of {_number(cost)} bounds if the mission fails"
     facts["Predicted contact lost" if lost else "Objective"] = value
 
+    status = result.history["status"].values[-1]
     return facts | {
         "Weakest bound": _weakest_bound(bounds),
         "Uncertain": _uncertain(bounds),
-        "Last mission": f"status {result.missions[-1].status}, contact {last}",
+        "Last mission": f"status {status}, contact {last}",
         "Reason for stopping": _ENDS.get(result.stop_reason, result.stop_reason),
     }
 
@@ -137,7 +139,7 @@ def bounds_of(result: Result) -> pd.DataFrame:
     - `measured`: mean of the measured contact rates over missions and robots; NaN if there is none.
     - `begun`: number of times that missions on this map began the bound, from the same cell.
     """
-    plan = result.plan
+    plan = result.plan()
     problem = result.planner.problem
     noise_sd = problem.recursion(result.belief.mean()).noise_sd
     contact = np.minimum(problem.likelihood.mean_rate(plan.trust, noise_sd), 1.0)
@@ -154,6 +156,25 @@ def bounds_of(result: Result) -> pd.DataFrame:
     table["measured"] = [np.nan, *(of_bound.mean() for of_bound in of_path)]
     table["begun"] = [0, *map(len, of_path)]
     return table
+
+
+def courses_of(result: Result) -> pd.DataFrame:
+    """Return the recommended path of each course on which missions were run, one row each."""
+    rows = []
+    for start, goal in dict.fromkeys(course.ends for course in result.courses):
+        plan = result.plan(start, goal)
+        rows.append(
+            {
+                "start": path_text([start]),
+                "goal": path_text([goal]),
+                "path": path_text(plan.path),
+                "bounds": len(plan.path) - 1,
+                "metres": round(plan.length),
+                "value": plan.value,
+                "p(arrival)": plan.p_arrive,
+            }
+        )
+    return pd.DataFrame(rows, index=pd.RangeIndex(1, len(rows) + 1, name="course"))
 
 
 def _weakest_bound(bounds: pd.DataFrame) -> str:
@@ -195,7 +216,7 @@ def _pictures(result: Result, path_table: pd.DataFrame) -> dict[str, str]:
 
     `path_table` is the table of `bounds_of`.
     """
-    plan = result.plan
+    plan = result.plan()
     sd = result.maps(n_draws=_DRAWS)["trust_sd"]
     draw: dict[str, Callable[[], Any]] = {
         "path": lambda: plots.cell_map(result.trust_map, plan.workspace, path=plan.path),
@@ -230,6 +251,9 @@ def _tables(result: Result, path_table: pd.DataFrame) -> dict[str, str]:
     missions: Any = result.table()
     missions["plan"] = np.where(missions["replanned"], "replanned", "")
     empty = [name for name in ("failed_bounds", "plan") if not missions[name].any()]
+    empty += [name for name in ("start", "goal", "robots") if missions[name].nunique() < 2]
+    if "start" in empty and "goal" in empty:
+        empty.append("lost_share")
     if not (missions["n_unmeasured"] > 0).any():
         empty.append("n_unmeasured")
     missions = missions[[name for name in _OF_MISSIONS if name not in empty]]
@@ -238,18 +262,21 @@ def _tables(result: Result, path_table: pd.DataFrame) -> dict[str, str]:
         missions = missions.rename(columns={"objective": "predicted_lost"})
     missions.columns = missions.columns.str.replace("_", " ")
 
-    last = result.history.isel(iteration=-1)
+    posterior = result.state.last
+    found = {} if posterior is None else posterior.diagnostics
     diagnostics = {
-        name: float(last[column])
+        name: float(found[column])
         for column, name in _DIAGNOSTICS.items()
-        if column in last and np.isfinite(last[column])
+        if np.isfinite(found.get(column, np.nan))
     }
     parameters: Any = summary(result.posterior, round_to="none")
     kept = [name for name in ("mean", "sd", "eti89_lb", "eti89_ub") if name in parameters]
 
+    courses = courses_of(result)
     return {
         "bounds": _table(bounds),
         "missions": _table(missions),
+        "courses": _table(courses) if len(courses) > 1 else "",
         "diagnostics": _table(_listed(diagnostics, "diagnostic")),
         "parameters": _table(parameters[kept].rename_axis("parameter")),
         "settings": _table(_listed(_settings(result), "setting")),

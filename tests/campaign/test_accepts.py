@@ -160,7 +160,7 @@ def scored(campaign, folder):
 ALWAYS = {
     "repr": lambda campaign, folder: repr(campaign) + campaign._repr_html_(),
     "table": lambda campaign, folder: campaign.table(),
-    "plan": lambda campaign, folder: campaign.plan,
+    "plan": lambda campaign, folder: campaign.plan(),
     "trust": lambda campaign, folder: campaign.trust("r2", campaign.path[0]),
     "robot_maps": lambda campaign, folder: campaign.robot_maps(),
     "plan of draws": lambda campaign, folder: campaign.planner.plan_draws(campaign.belief),

@@ -81,12 +81,17 @@ def test_first_posterior_is_that_of_the_earlier_missions(workspace, first):
         for name, values in expected[group].data_vars.items():
             np.testing.assert_array_equal(found[name].values, values.values)
     assert campaign.missions == []
-    assert campaign.table().empty
+    table = campaign.table()
+    assert table.index.tolist() == [-3, -2, -1]
+    assert set(table["state"]) == {"earlier"}
+    expected = first.table()["contact_lost"].tolist()
+    np.testing.assert_array_equal(table["contact_lost"], expected)
     assert "3 on this map, 0 elsewhere" in repr(campaign)
 
 
 def test_every_fit_includes_the_earlier_missions(workspace, first, second):
-    assert len(second.missions) == len(second.table()) == len(second.posteriors) == 2
+    assert len(second.missions) == len(second.posteriors) == 2
+    assert second.table().index.tolist() == [-3, -2, -1, 1, 2]
     assert second.posterior["latent"]["mission"].values.tolist() == [-3, -2, -1, 0, 1]
     assert second.posterior["robots"]["mission"].values.tolist() == [-3, -2, -1, 0, 1]
 
@@ -239,9 +244,7 @@ def test_an_unknown_robot_informs_shared_parameters(first):
     there = cells(seed=2, robots=("new", "r2"))
     one = run(cells(robots=("r3", "r2")), 3)
     blind = [replace(entry, mission=only(entry.mission, "r3")) for entry in one.state.entries]
-    result = tb.campaign.Result(
-        one.workspace, replace(one.state, entries=blind), one.learner, one._base
-    )
+    result = tb.campaign.Result(one.workspace, replace(one.state, entries=blind), one.learner)
     for model in (default_model(), HierarchicalTrust(effects=(PlaceEffect(), RobotEffect()))):
         campaign = tb.Campaign(there, *ENDS, earlier=result, model=model, **OPTIONS)
         prior = tb.Campaign(there, *ENDS, model=model, **OPTIONS).draw_prior(500)

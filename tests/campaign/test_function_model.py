@@ -77,7 +77,7 @@ def test_everything_that_reads_a_campaign_accepts_it(result, folder, workspace, 
     assert "the function saturating" in repr(result)
     assert result.path[0] == START
     assert result.path[-1] == GOAL
-    assert result.plan.value_band is not None
+    assert result.plan().value_band is not None
     assert set(result.maps().data_vars) >= {"trust_mean", "trust_sd", "path_probability"}
     assert len(result.explore().html) > 1000
     assert tb.check(result.posteriors, result.missions).verdict

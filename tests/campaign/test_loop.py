@@ -65,9 +65,9 @@ def test_result_recommends_the_best_path_under_the_last_posterior(result, worksp
     risk = tb.hazard.risk.BoundRisk(result.posterior["hazard"].to_dataset(), workspace)
     assert {mission.status for mission in result.missions} == {"ok"}  # so that no failure is priced
     plan = Planner(workspace, *ENDS, failure_cost=0.0).with_risk(risk.mean).plan(params)
-    assert (result.path, result.plan.value) == (list(plan.path), plan.value)
-    np.testing.assert_array_equal(result.plan.trust, plan.trust)
-    assert (result.plan.bands[0] < result.plan.bands[-1]).all()
+    assert (result.path, result.plan().value) == (list(plan.path), plan.value)
+    np.testing.assert_array_equal(result.plan().trust, plan.trust)
+    assert (result.plan().bands[0] < result.plan().bands[-1]).all()
     np.testing.assert_allclose(result.trust_map, Planner(workspace, *ENDS).trust_map(params))
 
 
@@ -96,7 +96,7 @@ def test_results_follow_the_missions_of_their_campaign(result, workspace):
     for _ in shorter.run(ModelSimulator(workspace), 3):
         pass
     assert shorter.table().equals(whole.table())
-    assert (shorter.path, shorter.plan.value) == (whole.path, whole.plan.value)
+    assert (shorter.path, shorter.plan().value) == (whole.path, whole.plan().value)
 
 
 def test_maps_are_over_the_posterior_and_lie_in_their_place(tmp_path):

@@ -90,7 +90,7 @@ def test_the_rest_is_the_best_of_all_rests(objective, family):
 
     # The belief is computed again, by a filter of the same bounds.
     workspace = campaign.workspace
-    trust = trust_filter(campaign)
+    trust = trust_filter(campaign, workspace)
     z = workspace.along((*PATH[:3], PATH[1]))
     rates = [*so_far.contact_rate, np.full(3, np.nan)]
     for of_bound, rate in zip(z, rates, strict=True):

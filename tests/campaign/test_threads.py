@@ -101,7 +101,7 @@ def test_missions_told_at_once_are_all_recorded_and_learned(workspace, tmp_path)
     path = ((2, 0), (1, 1), (0, 2))
     told = [ModelSimulator(workspace).run(path, seed=seed) for seed in range(N_THREADS)]
     with begin(workspace, tmp_path) as campaign:
-        run_all(lambda i: (campaign.ask(), campaign.tell(told[i]), campaign.plan))
+        run_all(lambda i: (campaign.ask(), campaign.tell(told[i]), campaign.plan()))
         found = {mission.contact_rate.tobytes() for mission in campaign.missions}
         assert found == {mission.contact_rate.tobytes() for mission in told}
         assert campaign.posterior["constant_data"].sizes["mission"] == N_THREADS

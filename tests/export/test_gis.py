@@ -96,7 +96,7 @@ def test_a_full_disk_leaves_the_side_files(maps, tmp_path):
 def test_places_in_geojson_are_those_of_the_plan(result, tmp_path):
     write_geojson(tmp_path / "高度.geojson", result)
     features = json.loads((tmp_path / "高度.geojson").read_text("utf-8"))["features"]
-    plan, crs = result.plan, result.workspace.grid.crs
+    plan, crs = result.plan(), result.workspace.grid.crs
     layers = {layer: [f for f in features if f["properties"]["layer"] == layer]
               for layer in ("path", "bounds", "posts", "routes")}  # fmt: skip
     assert len(layers["bounds"]) == len(plan.path)
@@ -114,7 +114,7 @@ def test_places_in_geojson_are_those_of_the_plan(result, tmp_path):
 
 
 def test_driven_bounds_are_marked_in_geojson(result, tmp_path):
-    write_geojson(tmp_path / "path.geojson", dataclasses.replace(result.plan, n_driven=1))
+    write_geojson(tmp_path / "path.geojson", dataclasses.replace(result.plan(), n_driven=1))
     features = json.loads((tmp_path / "path.geojson").read_text())["features"]
     about = [feature["properties"] for feature in features]
     assert about[0]["n_driven"] == 1
@@ -166,7 +166,7 @@ def test_a_file_has_the_suffix_of_its_format(maps, tmp_path):
 
 
 def test_without_a_terrain_there_is_no_place_on_earth(result, maps, nowhere, tmp_path):
-    bare = dataclasses.replace(result.plan, workspace=nowhere.workspace)
+    bare = dataclasses.replace(result.plan(), workspace=nowhere.workspace)
     for write, what in ((write_geojson, bare), (write_geotiff, maps.drop_vars("spatial_ref"))):
         with pytest.raises(TrustboError):
             write(tmp_path / "a.tif", what)
@@ -174,15 +174,15 @@ def test_without_a_terrain_there_is_no_place_on_earth(result, maps, nowhere, tmp
 
 
 def test_a_plan_is_written_in_the_formats_that_it_has(result, tmp_path):
-    assert export_result(result.plan, tmp_path) == [tmp_path / "path.geojson"]
-    written = export_result(result.plan, tmp_path / "both", ["geojson", "nav2"])
+    assert export_result(result.plan(), tmp_path) == [tmp_path / "path.geojson"]
+    written = export_result(result.plan(), tmp_path / "both", ["geojson", "nav2"])
     assert all(file.exists() for file in written)
     for name in ("geotiff", "csv"):
         with pytest.raises(TrustboError, match=name):
-            export_result(result.plan, tmp_path / "none", [name])
+            export_result(result.plan(), tmp_path / "none", [name])
     for write in (write_geotiff, write_csv):
         with pytest.raises(TrustboError, match="campaign"):
-            write(tmp_path / "a.tif", result.plan)
+            write(tmp_path / "a.tif", result.plan())
     assert not (tmp_path / "none").exists()
 
 

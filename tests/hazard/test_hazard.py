@@ -330,11 +330,11 @@ def test_a_failure_whose_next_move_is_unknown_is_shared_by_all_next_moves():
     east, south = 4, 6
 
     # A path that ends at its goal was planned to end there.
-    assert Trials.from_missions([stuck], goal=c).bounds.tolist() == [
+    assert Trials.from_missions([stuck], goals=[c]).bounds.tolist() == [
         [east, *b, east],
         [east, *c, END],
     ]
-    counted = Trials.from_missions([stuck], [lost], goal=(1, 2))
+    counted = Trials.from_missions([stuck], [lost], goals=[(1, 2)])
     assert counted.bounds.tolist() == [[east, *b, east], [east, *c, UNKNOWN], [east, *c, END]]
 
     # c has three next moves: south, the end of the path, and back, of which two are one unit.

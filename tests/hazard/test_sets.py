@@ -111,7 +111,7 @@ def test_a_failure_teaches_other_sets_with_the_same_steepest_route_and_no_others
     path = path_of(*failed)
     tipped = tb.Mission.from_arrays(path, np.full((1, 1, 3), 0.5), [[0.5]], status="tipped")
     before = BoundRisk(fit_hazard([], hilly), hilly)
-    group = fit_hazard([tipped], hilly, goal=path[-1][:2])
+    group = fit_hazard([tipped], hilly, goals=[path[-1][:2]])
     after = BoundRisk(group, hilly)
 
     assert after.failures[failed] == after.failures.sum() == 1.0
@@ -251,5 +251,7 @@ def test_a_campaign_with_sets_keeps_its_failures_and_says_with_which_posts(hilly
 
 def test_lost_missions_of_earlier_campaigns_keep_their_sets():
     lost = LostMission(((0, 0, "far"), (0, 1), (0, 2)), (0, 1))
-    earlier = EarlierMissions((mission(lost.path),), (lost,))
-    assert earlier_from_tree(earlier_to_tree(earlier)).lost == (lost,)
+    planned = ((lost.path, lost.path[:2]),)
+    earlier = EarlierMissions((mission(lost.path),), planned, (lost,))
+    found = earlier_from_tree(earlier_to_tree(earlier))
+    assert (found.lost, found.planned) == ((lost,), planned)

@@ -120,7 +120,7 @@ def test_a_mission_measures_the_awareness_of_its_posts(workspace):
 
 
 def test_a_campaign_chooses_sets_and_its_files_keep_them(workspace, result, tmp_path):
-    plan = result.plan
+    plan = result.plan()
     chosen = {cell[2:] for mission in result.missions for cell in mission.path}
     assert len(chosen) > 1
     assert (result.table()["state"] == "learned").all()
@@ -151,7 +151,7 @@ def test_a_stored_campaign_with_sets_resumes_as_if_it_had_not_stopped(workspace,
     assert again.workspace.onward.identical(workspace.onward)
     paths = [mission.path for mission in result.missions]
     assert [mission.path for mission in again.missions] == paths
-    assert again.plan.path == result.plan.path
+    assert again.plan().path == result.plan().path
 
 
 def test_a_mission_whose_first_bound_has_other_posts_is_learned(workspace):
@@ -224,7 +224,7 @@ def test_sets_that_a_workspace_does_not_offer_are_refused():
 
 def test_no_other_set_of_a_bound_makes_the_plan_better(workspace, result):
     table = result.compare_posts()
-    n_bounds = len(result.plan.path) - 1
+    n_bounds = len(result.plan().path) - 1
     assert table.index.get_level_values("bound").unique().tolist() == [*range(1, n_bounds + 1)]
     assert (table["chosen"].groupby("bound").sum() == 1).all()
     best = table.groupby("bound")["value"].max()
@@ -232,7 +232,7 @@ def test_no_other_set_of_a_bound_makes_the_plan_better(workspace, result):
         table.query("chosen")["value"].droplevel(1), best, rtol=0, atol=1e-12
     )
 
-    other = [(*result.plan.path[0][:2], "far"), *result.plan.path[1:]]
+    other = [(*result.plan().path[0][:2], "far"), *result.plan().path[1:]]
     expected = result.planner.evaluate(other, result.belief.mean())
     assert table.loc[(1, "far"), "value"] == pytest.approx(expected.value)
     assert table.loc[(1, "far"), "trust"] == pytest.approx(expected.trust[0].mean())

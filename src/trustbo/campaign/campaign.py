@@ -8,9 +8,10 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.choose import choose, warn_if_infeasible, warn_of_risk
+from trustbo.campaign.course import Course
 from trustbo.campaign.earlier import earlier_missions
 from trustbo.campaign.folder import FolderStorage
-from trustbo.campaign.learning import AWARENESS, as_learned, require_ends, require_new
+from trustbo.campaign.learning import AWARENESS, as_learned, require_new
 from trustbo.campaign.past_failures import with_past_failures
 from trustbo.campaign.read import lock_campaign, read_campaign, warn_of_unrecorded
 from trustbo.campaign.recorder import Recorder
@@ -25,13 +26,16 @@ from trustbo.campaign.settings import (
 from trustbo.campaign.simulated import require_simulator, run_missions, settings_of
 from trustbo.campaign.state import Entry, Failure, State
 from trustbo.campaign.stopping import Stop, require_stop
-from trustbo.data import Cell, Mission, cells_of
-from trustbo.display import say
+from trustbo.data import Cell, Mission, cells_of, require_path
+from trustbo.display import joined, say
 from trustbo.errors import (
     TrustboError,
+    one_line,
     require_bounds,
     require_choice,
     require_kind,
+    require_list,
+    require_order,
     require_pair,
     require_whole,
     warn,
@@ -41,15 +45,19 @@ from trustbo.hazard import Hazard
 from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import CAUSES
 from trustbo.inference.learner import Model, learner_from_record, learner_of
-from trustbo.planning import Plan, Planner
+from trustbo.planning import NoPathError, Plan, Planner
 from trustbo.planning.policies import Policy, resolve_policy
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
+from trustbo.workspace.moves import MOVES
 
 
 class Campaign(Recorder):
     """Campaign that learns from missions and proposes the next path (ask/tell interface).
+
+    A campaign is about a ground and a team. What it learns in one mission helps on all courses, so
+    each mission may have a start and a goal of its own, and robots may stay at home.
 
     `ask` plans a path, and `tell` records the mission on this path and learns from it. With a
     `directory`, each mission is written to disk before the posterior is updated, and
@@ -65,15 +73,16 @@ class Campaign(Recorder):
         storage: `FolderStorage` of the campaign, or a `MemoryStorage`.
 
     Example:
-        >>> with tb.Campaign(workspace, (9, 0), (0, 9), directory="field") as campaign:
-        ...     campaign.tell(drive(campaign.ask().path))  # your robots
+        >>> with tb.Campaign(workspace, directory="field") as campaign:
+        ...     plan = campaign.ask(start=(9, 0), goal=(0, 9))
+        ...     campaign.tell(drive(plan.path))  # your robots
     """
 
     def __init__(
         self,
         workspace: Workspace,
-        start: Location,
-        goal: Location,
+        start: Location | None = None,
+        goal: Location | None = None,
         *,
         model: Model | None = None,
         policy: str | Policy = "explore",
@@ -96,8 +105,9 @@ class Campaign(Recorder):
 
         Args:
             workspace: Workspace of the paths.
-            start: First cell of every path, or a position in this cell; see `Workspace.locate`.
-            goal: Last cell of every path, or a position in this cell.
+            start: First cell of the paths for which `ask` is given no other, or a position in this
+                cell; see `Workspace.locate`. By default, each call of `ask` needs a start and goal.
+            goal: Last cell of these paths, or a position in this cell.
             model: Trust model, or a NumPyro function `model(awareness, contact_rate=None)`; by
                 default `models.default_model()`, with place and robot effects.
             policy: Name in `planning.POLICIES`, or a callable `policy(rng, draws, planner)` that
@@ -128,7 +138,8 @@ class Campaign(Recorder):
             progress: Whether to show progress bars for slow fits.
 
         Raises:
-            TrustboError: The start or goal is not a passable cell, a name is unknown, the sampler
+            TrustboError: Only one of start and goal is given or is not a passable cell, a name is
+                unknown, the sampler
                 does not support the model, an option cannot be stored in a file, or the folder
                 already contains a campaign or cannot be written. The same error is raised if an
                 earlier campaign has other features, shares no robot with the team, or has no
@@ -148,12 +159,18 @@ class Campaign(Recorder):
         require_choice("sampler", sampler, learner.samplers)
 
         self.policy = resolve_policy(policy)
-        base = Planner(workspace, start, goal, objective, family=learner.family, **options)
+        has_course = start is not None
+        if has_course != (goal is not None):
+            missing = "goal" if has_course else "start"
+            raise TrustboError(f"{missing} is missing; give both start and goal, or neither.")
+        ends: tuple[Any, Any] = (start, goal) if has_course else _any_ends(workspace)
+        base = Planner(workspace, *ends, objective, family=learner.family, **options)
         settings = to_settings(
             base,
             learner,
             policy,
             hazard,
+            has_course=has_course,
             objective=objective,
             sampler=sampler,
             seed=require_whole("seed", seed, 0),
@@ -165,7 +182,7 @@ class Campaign(Recorder):
 
         state = State(settings, earlier=earlier_missions(earlier, workspace))
         learner.require_poolable(state.earlier.missions, workspace.team.names)
-        super().__init__(workspace, state, learner, base)
+        super().__init__(workspace, state, learner)
 
         self._progress = progress
         self._has_warned_of_risk = False
@@ -178,52 +195,93 @@ class Campaign(Recorder):
         if directory is not None:
             self.store_in(directory, overwrite=overwrite)
 
-    def ask(self) -> Plan:
+    def ask(
+        self,
+        start: Location | None = None,
+        goal: Location | None = None,
+        *,
+        robots: Sequence[str] | None = None,
+    ) -> Plan:
         """Plan the next path; further calls return the same plan until `tell`, `fail` or `suggest`.
 
-        The plan is recorded before it is returned.
+        A call with another course or other robots replaces the plan. The plan is recorded before it
+        is returned.
+
+        Args:
+            start: First cell, or a position in this cell; see `Workspace.locate`. By default, that
+                of the campaign.
+            goal: Last cell, or a position in this cell; by default, that of the campaign.
+            robots: Names of the robots that take part; by default the whole team. The objective is
+                averaged over these robots, which have the same posts as in the whole team, and
+                `tell` then expects their contact rates alone.
 
         Raises:
-            TrustboError: The policy did not return a plan, its path is invalid, or the plan cannot
-                be recorded.
+            TrustboError: A start or goal is missing or not passable, a robot is unknown, the model
+                needs the whole team, the policy did not return a plan, its path is invalid, or the
+                plan cannot be recorded. The plan asked for before then remains.
+            NoPathError: The goal cannot be reached.
+
+        Example:
+            >>> plan = campaign.ask(start=(9, 0), goal=(0, 9), robots=("r1", "r3"))
+            >>> plan.robots
+            ('r1', 'r3')
         """
         with self._turn:
-            if self.state.asked is None:
-                plan = self._propose()
-                self._accept(plan, self.risk)
-                return plan
-            return self.state.asked
+            asked = self.state.asked
+            if asked is not None and start is None and goal is None and robots is None:
+                return asked
 
-    def _propose(self) -> Plan:
-        """Plan the next path with the policy."""
+            course = self._course(start, goal, robots, usual=self._own_ends)
+            if asked is not None and course == Course.of(asked):
+                return asked
+
+            plan = self._propose(course)
+            self._accept(plan, self.risk)
+            return plan
+
+    def _propose(self, course: Course) -> Plan:
+        """Plan the next path of a course with the policy."""
         self.storage.require_open()
         self._learn()
         rng = np.random.default_rng(self.state.seed_of("policy"))
-        driven = [entry.mission.path for entry in self.state.entries]
+        entries = self.state.entries
+        driven = [entry.mission.path for entry in entries if entry.course.ends == course.ends]
         name = self.state.settings["policy"]
-        plan = choose(self.policy, name, rng, self.belief, self.planner, driven)
+        belief = self._belief_of(course)
+        plan = choose(self.policy, name, rng, belief, self.planner_of(course), driven)
         return self._completed(plan)
 
     def _completed(self, plan: Plan) -> Plan:
         """Add posterior bands and past failures to a plan."""
-        plan = with_past_failures(plan, self.state, self.planner)
-        return plan.with_draws(self.planner.evaluate(plan.path, self.forecast))
+        planner = self.planner_of(Course.of(plan))
+        plan = with_past_failures(plan, self.state, planner)
+        return plan.with_draws(planner.evaluate(plan.path, self.forecast))
 
-    def suggest(self, path: Sequence[Cell]) -> Plan:
+    def _evaluated(self, path: Sequence[Cell], course: Course) -> Plan:
+        """Plan a given path of a course."""
+        belief = self._belief_of(course)
+        return self._completed(self.planner_of(course).evaluate(path, belief.mean()))
+
+    def suggest(self, path: Sequence[Cell], *, robots: Sequence[str] | None = None) -> Plan:
         """Set the next path manually; `ask` then returns it.
 
         Args:
-            path: Cells from start to goal.
+            path: Cells from any start to any goal.
+            robots: Names of the robots that take part; by default the whole team.
 
         Raises:
-            TrustboError: The path is invalid, or does not lead from start to goal, or it cannot be
-                recorded. `ask` then returns the same plan as before.
+            TrustboError: The path is invalid, a robot is unknown, or the plan cannot be recorded.
+                `ask` then returns the same plan as before.
         """
         with self._turn:
             self.storage.require_open()
+            cells = require_path("path", path)
+            if len(cells) < 2:
+                raise TrustboError(f"path must have two cells or more; got {len(cells)}.")
 
             self._learn()
-            plan = self._completed(self.planner.evaluate(path, self.belief.mean()))
+            course = self._course(cells[0][:2], cells[-1][:2], robots, usual=None)
+            plan = self._evaluated(cells, course)
             self._accept(plan, self.risk)
             return plan
 
@@ -271,10 +329,11 @@ class Campaign(Recorder):
             cell = self.workspace.locate(cell, "cell")
             if so_far is not None:
                 require_kind("so_far", so_far, Mission, "give the bounds so far as a Mission")
-                so_far = self.workspace.in_order(so_far)
+                so_far = self._in_order(so_far, plan.robots)
             closed = require_bounds("blocked", blocked)
 
-            plan, risk = plan_rest(self, self._base, self.policy, plan, cell, so_far, closed)
+            base = self._base_of(Course.of(plan))
+            plan, risk = plan_rest(self, base, self.policy, plan, cell, so_far, closed)
             self._accept(plan, risk)
             return plan
 
@@ -284,14 +343,16 @@ class Campaign(Recorder):
         warn_if_infeasible(plan)
         if not self._has_warned_of_risk:  # once per campaign
             options = self.state.settings["planner"]
-            self._has_warned_of_risk = warn_of_risk(plan, risk, self.planner, options)
+            planner = self.planner_of(Course.of(plan))
+            self._has_warned_of_risk = warn_of_risk(plan, risk, planner, options)
 
     def tell(self, mission: Mission, *, again: bool = False) -> xr.DataTree | None:
         """Record a mission and learn from it.
 
         For learning, the awareness of the map replaces the measured awareness, unless the campaign
         has `awareness="measured"`. Robots and features may be in any order, and the path may differ
-        from the planned path.
+        from the planned path. A mission that began or ended elsewhere than planned is a mission on
+        the course of its own path, with a warning.
 
         Args:
             mission: Measured mission, whether or not it reached the goal.
@@ -303,30 +364,31 @@ class Campaign(Recorder):
             (yet), a warning is issued, and the previous posterior or None is returned.
 
         Raises:
-            TrustboError: The robots or features differ from the workspace's; the path leaves the
-                grid, skips cells, or does not begin at the start of the plan; the status is "ok",
-                but the path does not end at the goal; the mission was told before; or it cannot be
-                written. The mission is then not recorded.
+            TrustboError: The robots differ from those of the plan, or the features from the
+                workspace's; the path leaves the grid or skips cells; no path leads from its start
+                to its end; the mission was told before; or it cannot be written. The mission is
+                then not recorded.
 
         Warns:
-            UserWarning: The mission is recorded but excluded or not learned yet, or what was
-                learned could not be written.
+            UserWarning: The mission began or ended elsewhere than planned; it is recorded but
+                excluded or not learned yet; or what was learned could not be written.
         """
         require_kind("mission", mission, Mission, "give one trustbo.Mission at a time")
         with self._turn:
             self.storage.require_open()
-            mission = self.workspace.in_order(mission)
+            asked = self.state.asked
+            mission = self._in_order(mission, None if asked is None else asked.robots)
             if not again:
                 require_new(self.state, mission)
 
-            # If no path was asked for since the last mission, one is planned here, which may be
-            # slow.
-            plan = self.state.asked or self._propose()
-            require_ends(plan, mission)
             learned = as_learned(mission, self.workspace, self.state.settings["awareness"])
+            if mission.robots != self.workspace.team.names:
+                self.learner.require_poolable([learned], self.workspace.team.names)
+            plan = self._plan_told(mission)
+            trust_map = self._trust_map_of(Course.of(plan))
 
             before = self.state
-            entry = Entry(plan, mission, learned, self.trust_map, posterior=before.last)
+            entry = Entry(plan, mission, learned, trust_map, posterior=before.last)
             recorded = f"mission {len(before.entries) + 1} is recorded"
             try:
                 self._record(entries=(*before.entries, entry), asked=None)
@@ -339,6 +401,61 @@ class Campaign(Recorder):
                 warn(f"mission {len(self.state.entries)} is excluded: {entry.why_excluded}")
             self._learn_and_write(recorded)
             return self.state.posterior
+
+    def _in_order(self, mission: Mission, robots: Sequence[str] | None) -> Mission:
+        """Return a mission with its robots and features in the order of the workspace.
+
+        Args:
+            mission: Mission of the whole team, or of the robots that take part.
+            robots: Robots that take part in the plan; None for the whole team.
+
+        Raises:
+            TrustboError: The robots or features differ.
+        """
+        team = self.workspace.team.names
+        went = set(mission.robots)
+        if robots is not None and went == set(robots):
+            return self.workspace.of_robots(robots).in_order(mission)
+
+        absent = [name for name in team if name not in went]
+        if absent and went < set(team):
+            planned = "" if robots is None else f", but {joined(robots)} were planned"
+            raise TrustboError(
+                f"the mission has no rates of {joined(absent)}{planned}; give rates that are NaN, "
+                f"or first call ask with robots={tuple(mission.robots)}."
+            )
+        return self.workspace.in_order(mission)
+
+    def _plan_told(self, mission: Mission) -> Plan:
+        """Return the plan of a mission that is told.
+
+        It is the plan that was asked for, if the mission has its start and its goal. If no path was
+        asked for, it is planned here, which may be slow. A mission on another course has the plan
+        of its own path.
+        """
+        start, last = (mission.path[k][:2] for k in (0, -1))
+        asked = self.state.asked
+        ends = self._own_ends if asked is None else (asked.start, asked.goal)
+        if ends is not None and start == ends[0] and (mission.status != "ok" or last == ends[1]):
+            if asked is not None:
+                return asked
+            return self._propose(self._course(*ends, mission.robots, usual=None))
+
+        course = self._course(start, last, mission.robots, usual=None)
+        self.storage.require_open()
+        self._learn()
+        try:
+            plan = self._evaluated(mission.path, course)
+        except NoPathError:
+            raise
+        except TrustboError:  # the map says that a bound of the path cannot be driven
+            plan = self._propose(course)
+        if ends is not None:
+            warn(
+                f"the mission leads from {start} to {last}, not from {ends[0]} to {ends[1]} as "
+                "planned; it is recorded as a mission on the course that it drove."
+            )
+        return plan
 
     def fail(self, reason: str, *, where: Cell | None = None) -> None:
         """Report that no bound of the planned mission was measured; `ask` then plans again.
@@ -395,6 +512,7 @@ class Campaign(Recorder):
         simulator: Simulator | None = None,
         n_iterations: int = 8,
         *,
+        courses: Sequence[Sequence[Location]] | None = None,
         stop: Stop | None = None,
         progress: bool = False,
     ) -> Iterator[tuple[Plan, Mission]]:
@@ -402,6 +520,7 @@ class Campaign(Recorder):
 
         Missions run only while you iterate: `for plan, mission in campaign.run(simulator, 8)`.
         The arguments are the same as in `iterate`; `n_iterations` includes earlier missions.
+        Without `courses`, all missions have the course of the campaign.
 
         Yields:
             Each plan and its mission, after the posterior has been updated.
@@ -412,19 +531,51 @@ class Campaign(Recorder):
         require_whole("n_iterations", n_iterations, 1)
         runner = require_simulator(self, simulator)
         require_stop(stop)
+        ends = self._require_courses(courses)
 
         with self._turn:
-            self.state = replace(self.state, simulation=settings_of(runner, n_iterations))
+            self.state = replace(self.state, simulation=settings_of(runner, n_iterations, ends))
             self._progress = progress
-        return self._run(runner, n_iterations, stop)
+        return self._run(runner, n_iterations, ends, stop)
+
+    def _require_courses(
+        self, courses: Sequence[Sequence[Location]] | None
+    ) -> list[tuple[Cell, Cell]]:
+        """Return start and goal of each course; none if missions take the campaign's own.
+
+        Raises TrustboError or NoPathError for a course on which no path can be planned.
+        """
+        if courses is None:
+            if self._own_ends is None:
+                raise TrustboError(
+                    "the campaign has no course of its own; give courses=[(start, goal), ...]."
+                )
+            return []
+
+        remedy = "give a list of pairs (start, goal)"
+        found = []
+        for given in require_list("courses", require_order("courses", courses), remedy=remedy):
+            ends: list[Any] = require_list("a course", require_order("a course", given))
+            if len(ends) != 2:
+                raise TrustboError(f"a course is a start and a goal; got {one_line(given)}.")
+            course = self._course(ends[0], ends[1], None, usual=None)
+            self._base_of(course)
+            found.append(course.ends)
+        if not found:
+            raise TrustboError(f"courses must have one entry or more; {remedy}.")
+        return found
 
     def _run(
-        self, simulator: Simulator, n_iterations: int, stop: Stop | None
+        self,
+        simulator: Simulator,
+        n_iterations: int,
+        courses: Sequence[tuple[Cell, Cell]],
+        stop: Stop | None,
     ) -> Iterator[tuple[Plan, Mission]]:
         """Run missions for `run`, which has checked the arguments."""
         self.state = replace(self.state, stop_reason="interrupted")
         reason = yield from run_missions(
-            self, self.ask, self.tell, simulator, n_iterations, stop, self._progress
+            self, self.ask, self.tell, simulator, n_iterations, courses, stop, self._progress
         )
         with self._turn:
             self._record(stop_reason=reason)
@@ -475,3 +626,14 @@ class Campaign(Recorder):
             lock.release()
             raise
         return campaign
+
+
+def _any_ends(workspace: Workspace) -> tuple[Cell, Cell]:
+    """Return the ends of a bound, for a planner that checks the options of a campaign."""
+    bounds = np.argwhere(workspace.passable_bounds.values)
+    if not len(bounds):
+        raise TrustboError("the robots can drive no bound of this workspace; choose another team.")
+
+    move, row, col = bounds[0].tolist()
+    down, right = MOVES[move]
+    return (row - down, col - right), (row, col)

@@ -9,7 +9,12 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from trustbo.campaign.result import Result
-from trustbo.campaign.state import EarlierMissions, why_never_learned
+from trustbo.campaign.state import (
+    EarlierMissions,
+    Planned,
+    planned_paths,
+    why_never_learned,
+)
 from trustbo.data import Mission
 from trustbo.display import joined
 from trustbo.errors import TrustboError, require_list
@@ -41,6 +46,7 @@ def earlier_missions(
 
     here = map_name(workspace)
     missions: list[Mission] = []
+    planned: list[Planned] = []
     lost: list[LostMission] = []
     of_missions: list[_Source] = []
     of_lost: list[_Source] = []
@@ -57,23 +63,31 @@ def earlier_missions(
             on = mission.map or there
             mission = mission.in_order(mission.robots, workspace.features, ())
             missions.append(replace(mission, map="" if on == here else on))
+        planned += found.planned
         of_missions += _sources(k, len(inherited.missions), len(found.missions))
         if there == here:
             lost += found.lost
             of_lost += _sources(k, len(inherited.lost), len(found.lost))
 
     alike = pooled(workspace.team.names, missions)
+    kept = _without_repeats(alike, of_missions, Mission.has_same_data)
+    of_lost_kept = _without_repeats(lost, of_lost, LostMission.__eq__)
     return EarlierMissions(
-        tuple(_without_repeats(alike, of_missions, Mission.has_same_data)),
-        tuple(_without_repeats(lost, of_lost, LostMission.__eq__)),
+        tuple(alike[j] for j in kept),
+        tuple(planned[j] for j in kept),
+        tuple(lost[j] for j in of_lost_kept),
     )
 
 
 def _missions_of(result: Result) -> EarlierMissions:
     """Return the missions of a result to learn from, starting with its own earlier ones."""
     state = result.state
-    own = [entry.mission for entry in state.entries if entry.exclusion is None]
-    return EarlierMissions((*state.earlier.missions, *own), tuple(state.lost))
+    own = [entry for entry in state.entries if entry.exclusion is None]
+    return EarlierMissions(
+        (*state.earlier.missions, *(entry.mission for entry in own)),
+        (*state.earlier.planned, *(planned_paths(entry.plan) for entry in own)),
+        tuple(state.lost),
+    )
 
 
 class _Source(NamedTuple):
@@ -95,27 +109,28 @@ def _sources(result: int, n_inherited: int, n: int) -> list[_Source]:
 
 def _without_repeats[T](
     missions: Sequence[T], sources: Sequence[_Source], is_same: Callable[[T, T], bool]
-) -> list[T]:
-    """Return missions without those that are also in another result, because it inherited them.
+) -> list[int]:
+    """Return indices of missions without those also in another result, because it inherited them.
 
     Missions of two campaigns that are equal by chance are both kept, if neither is inherited.
     """
-    kept: list[tuple[T, _Source]] = []
-    matched: set[tuple[int, int]] = set()  # index of a mission in `kept`, and of another result
-    for mission, source in zip(missions, sources, strict=True):
+    kept: list[int] = []
+    matched: set[tuple[int, int]] = set()  # index of a mission that is kept, and of another result
+    for i, (mission, source) in enumerate(zip(missions, sources, strict=True)):
         twin = None
-        for j, (other, of_other) in enumerate(kept):
+        for j in kept:
+            of_other = sources[j]
             is_possible = source.result != of_other.result and (j, source.result) not in matched
             is_shared = source.is_inherited or of_other.is_inherited
-            if is_possible and is_shared and is_same(mission, other):
+            if is_possible and is_shared and is_same(mission, missions[j]):
                 twin = j
                 break
 
         if twin is None:
-            kept.append((mission, source))
+            kept.append(i)
         else:
             matched.add((twin, source.result))
-    return [mission for mission, _ in kept]
+    return kept
 
 
 def _require_alike(

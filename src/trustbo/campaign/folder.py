@@ -64,7 +64,7 @@ from trustbo.files import (
 )
 from trustbo.hazard.trials import LostMission
 from trustbo.logs.netcdf import missions_from_tree, missions_to_tree, tree_to_bytes
-from trustbo.planning.plan import plan_to_record
+from trustbo.planning.plan import as_tuples, plan_to_record
 from trustbo.workspace import Workspace
 from trustbo.workspace.netcdf import difficulty_to_tree, workspace_to_tree
 
@@ -338,6 +338,7 @@ def _version_of(file: Path) -> tuple[int, int, int] | None:
 def earlier_to_tree(earlier: EarlierMissions) -> xr.DataTree:
     """Convert earlier missions to a data tree."""
     tree = missions_to_tree(earlier.missions)
+    tree.attrs["planned"] = to_json(earlier.planned)
     tree.attrs["lost"] = to_json([mission._asdict() for mission in earlier.lost])
     return tree
 
@@ -350,4 +351,6 @@ def earlier_from_tree(tree: xr.DataTree) -> EarlierMissions:
         where = record["where"]
         path = tuple(map(tuple, record["path"]))
         lost.append(LostMission(path, None if where is None else tuple(where)))
-    return EarlierMissions(tuple(missions_from_tree(tree)), tuple(lost))
+    missions = tuple(missions_from_tree(tree))
+    planned = as_tuples(json.loads(tree.attrs.get("planned", "[]"))) or ((),) * len(missions)
+    return EarlierMissions(missions, planned, tuple(lost))

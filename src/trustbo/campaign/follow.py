@@ -54,15 +54,16 @@ class Follower(Summary):
             TrustboError: `campaign` is not a campaign, or cannot plan a path (see `Campaign.ask`).
         """
         require_kind("campaign", campaign, Campaign, "give a trustbo.Campaign")
-        self.path: tuple[Station, ...] = tuple(campaign.ask().path)
+        plan = campaign.ask()
+        self.path: tuple[Station, ...] = tuple(plan.path)
         self._campaign = campaign
-        self._workspace = campaign.workspace
+        self._workspace = plan.workspace
         self._goal = self.path[-1]
         self.bounds: tuple[Bound, ...] = ()
         self.running = False
 
         self._is_over = False  # whether a bound failed, after which nothing was planned
-        start = trust_filter(campaign)
+        start = trust_filter(campaign, self._workspace)
 
         # `_before` covers the bounds that have ended; `_now` also covers the bound in progress.
         self._before = self._now = start

@@ -2,12 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 
-from trustbo.campaign.state import Posterior, State, why_never_learned
-from trustbo.data import OF_BOUNDS, Mission, Station, cells_of
+from trustbo.campaign.state import (
+    Planned,
+    Posterior,
+    State,
+    planned_paths,
+    why_never_learned,
+)
+from trustbo.data import OF_BOUNDS, Cell, Mission, Station, cells_of
 from trustbo.errors import PosteriorError, TrustboError, warn
 from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard
@@ -15,7 +22,6 @@ from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.fit import fit
 from trustbo.inference.learner import Learner
 from trustbo.inference.tree import parameters_alone
-from trustbo.planning import Plan
 from trustbo.stacking import pooled
 from trustbo.workspace import Workspace
 
@@ -26,8 +32,11 @@ AWARENESS = ("map", "measured")
 def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Mission:
     """Return a mission with the awareness from which a campaign learns.
 
+    The result has all robots of the workspace; those that stayed at home have no rates.
+
     Args:
-        mission: Mission with the awareness that was measured, NaN where it was not.
+        mission: Mission with the awareness that was measured, NaN where it was not, by the robots
+            that took part.
         workspace: Workspace of the mission.
         awareness: `"map"` for the awareness of the map, which the planner also uses; `"measured"`
             for the measured awareness. Where this source is NaN, the other one is used.
@@ -36,7 +45,8 @@ def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Missio
         TrustboError: The path leaves the grid or skips cells.
     """
     try:
-        known = workspace.along(mission.path, anywhere=True)[: len(mission.bounds)]
+        seen = workspace.of_robots(mission.robots)
+        known = seen.along(mission.path, anywhere=True)[: len(mission.bounds)]
     except TrustboError as error:
         if any(status != "ok" for status in mission.bound_status[:-1]):
             raise TrustboError(
@@ -47,7 +57,8 @@ def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Missio
 
     measured = mission.awareness
     first, second = (measured, known) if awareness == "measured" else (known, measured)
-    return mission.with_awareness(np.where(np.isnan(first), second, first))
+    learned = mission.with_awareness(np.where(np.isnan(first), second, first))
+    return learned.with_robots(workspace.team.names)
 
 
 def require_new(state: State, mission: Mission) -> None:
@@ -62,20 +73,6 @@ def require_new(state: State, mission: Mission) -> None:
                 f"mission {n} has the same data, so this mission is recorded already. If it is "
                 "another mission, call tell(mission, again=True)."
             )
-
-
-def require_ends(plan: Plan, mission: Mission) -> None:
-    """Raise TrustboError unless a mission has the plan's start and, if it is "ok", its goal."""
-    start, goal = (plan.path[k][:2] for k in (0, -1))
-    first, last = (mission.path[k][:2] for k in (0, -1))
-    if first != start:
-        raise TrustboError(f"the mission starts in cell {first}; it must start in {start}.")
-    if mission.status == "ok" and last != goal:
-        raise TrustboError(
-            f'the status "ok" means that the goal {goal} was reached, but the mission ends in cell '
-            f"{last}; give the planned cells up to the goal, and a status such as "
-            '"aborted".'
-        )
 
 
 def with_posterior(
@@ -173,12 +170,13 @@ def learn_hazard(state: State, workspace: Workspace, so_far: Mission | None = No
     progress are included as well. If the diagnostics fail, the previous posterior is returned with
     a warning.
     """
-    measured = [mission for _, mission in missions_of_hazard(state, so_far)]
+    measured = missions_of_hazard(state, so_far)
+    missions = [one.mission for one in measured]
+    goals = [one.goal for one in measured]
     prior = Hazard(**state.settings["hazard"])
     seed = state.seed_of("hazard")
-    goal = tuple(state.settings["goal"])
     try:
-        return fit_hazard(measured, workspace, prior, lost=state.lost, goal=goal, seed=seed)
+        return fit_hazard(missions, workspace, prior, lost=state.lost, goals=goals, seed=seed)
     except PosteriorError as error:
         warn(f"{error} The campaign uses the previous hazard posterior.")
 
@@ -188,44 +186,68 @@ def learn_hazard(state: State, workspace: Workspace, so_far: Mission | None = No
     return fit_hazard([], workspace, prior)
 
 
-def missions_of_hazard(
-    state: State, so_far: Mission | None = None
-) -> list[tuple[int | None, Mission]]:
-    """Return the measured missions from which the hazard is learned, with their numbers.
+class Tried(NamedTuple):
+    """Mission, or a part of it, from which the hazard is learned.
 
-    The numbers are those of `Result.table`; missions of earlier campaigns have none. A mission in
-    progress comes last. A mission that was replanned after a failure has several parts; see
-    `_parts` and `learn_hazard`.
+    Attributes:
+        number: Number of the mission in `Result.table`; None for missions of earlier campaigns.
+        mission: Bounds that were run, with the cells that were planned after them.
+        goal: Last cell of the planned path; None if it is not known.
     """
-    measured: list[tuple[int | None, Mission]] = [
-        (None, mission) for mission in state.earlier.missions if not mission.map
-    ]
+
+    number: int | None
+    mission: Mission
+    goal: Cell | None
+
+
+def missions_of_hazard(state: State, so_far: Mission | None = None) -> list[Tried]:
+    """Return the measured missions from which the hazard is learned.
+
+    A mission in progress comes last. A mission that was replanned after a failure has several
+    parts; see `_parts`.
+    """
+    measured = []
+    earlier = state.earlier
+    for mission, planned in zip(earlier.missions, earlier.planned, strict=True):
+        if not mission.map:
+            measured += _tried(None, mission, planned)
+
     for number, entry in enumerate(state.entries, start=1):
         if entry.exclusion is None:
-            measured += [(number, part) for part in _parts(entry.measured, entry.plan)]
+            measured += _tried(number, entry.measured, planned_paths(entry.plan))
+
     if so_far is not None:
-        parts = [so_far] if state.asked is None else _parts(so_far, state.asked)
-        measured += [(len(state.entries) + 1, part) for part in parts]
+        planned = () if state.asked is None else planned_paths(state.asked)
+        measured += _tried(len(state.entries) + 1, so_far, planned)
     return measured
 
 
-def _parts(mission: Mission, plan: Plan) -> list[Mission]:
+def _tried(number: int | None, mission: Mission, planned: Planned) -> list[Tried]:
+    """Return the parts of a mission, given its planned paths."""
+    if not planned:
+        return [Tried(number, mission, None)]
+    goal = planned[0][-1][:2]
+    return [Tried(number, part, goal) for part in _parts(mission, planned)]
+
+
+def _parts(mission: Mission, planned: Planned) -> list[Mission]:
     """Split a mission where a bound failed and it was replanned, and add the planned cells.
 
     Each part ends with the cells that were planned when its last bound failed. The way back from a
     bound that failed belongs to no part if it was completed, as in `Trials`.
     """
+    last, *abandoned = planned
     parts = []
     first = 0  # bound with which the next part begins
-    for path in plan.abandoned:
+    for path in abandoned:
         cells = cells_of(path)
         failed = next((k for k in range(first, len(mission.statuses)) if _failed(mission, k)), None)
         if failed is None or cells[: failed + 2] != cells_of(mission.path[: failed + 2]):
             continue
 
         part = _some_bounds(mission, first, failed + 1, mission.statuses[failed])
-        planned = (*mission.path[first : failed + 1], *path[failed + 1 :])
-        parts.append(replace(part, path=planned))
+        rest = (*mission.path[first : failed + 1], *path[failed + 1 :])
+        parts.append(replace(part, path=rest))
 
         first = failed + 1
         is_back = cells_of(mission.path[first + 1 : first + 2]) == (cells[failed],)
@@ -233,10 +255,10 @@ def _parts(mission: Mission, plan: Plan) -> list[Mission]:
             first += 1
 
     if first == 0:
-        return [_with_planned_path(mission, plan.path)]
+        return [_with_planned_path(mission, last)]
     if first < len(mission.statuses):
         rest = _some_bounds(mission, first, len(mission.statuses), mission.status)
-        parts.append(_with_planned_path(rest, plan.path[first:]))
+        parts.append(_with_planned_path(rest, last[first:]))
     return parts
 
 

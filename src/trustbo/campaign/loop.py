@@ -1,7 +1,7 @@
 """Run whole campaigns in a simulator, and resume them."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from typing import Any
 
@@ -18,9 +18,10 @@ from trustbo.workspace.grid import Location
 
 def iterate(
     workspace: Workspace,
-    start: Location,
-    goal: Location,
+    start: Location | None = None,
+    goal: Location | None = None,
     *,
+    courses: Sequence[Sequence[Location]] | None = None,
     n_iterations: int = 8,
     simulator: Simulator | None = None,
     stop: Stop | None = None,
@@ -36,6 +37,8 @@ def iterate(
         start: First cell (row, col), with row 0 in the north, or a position in this cell, such as
             `{"x": 1748000, "y": 5427000}` in CRS metres; see `Workspace.locate`.
         goal: Last cell, or a position in this cell.
+        courses: Start and goal of each mission, instead of `start` and `goal`; mission k has the
+            course k modulo the number of courses.
         n_iterations: Maximum number of missions.
         simulator: Simulator with `run(path, *, seed, mission) -> Mission`; by default
             `KinematicSimulator(workspace)`, or `RealtimeAwareness` of it if `awareness="measured"`.
@@ -60,10 +63,14 @@ def iterate(
     Example:
         >>> result = tb.iterate(workspace, start=(9, 0), goal=(0, 9), n_iterations=8)
         >>> result.path
+        >>> courses = [((9, 0), (0, 9)), ((0, 0), (9, 9))]
+        >>> tb.iterate(workspace, courses=courses, n_iterations=2).table()[["start", "goal"]]
     """
     _require_arguments(options)
+    if (start is None and goal is None) == (courses is None):
+        raise TrustboError("give start and goal, or courses=[(start, goal), ...], and not both.")
     campaign = Campaign(workspace, start, goal, progress=progress, **options)
-    steps = campaign.run(simulator, n_iterations, stop=stop, progress=progress)
+    steps = campaign.run(simulator, n_iterations, courses=courses, stop=stop, progress=progress)
     with campaign:
         if directory is not None:  # after all input has been checked
             campaign.store_in(directory, overwrite=overwrite)
@@ -128,10 +135,13 @@ def resume(
             return campaign
 
         total = before.get("n_iterations", 8) if n_iterations is None else n_iterations
-        steps = campaign.run(simulator, total, stop=stop, progress=progress)
+        courses = before.get("courses")
+        steps = campaign.run(simulator, total, courses=courses, stop=stop, progress=progress)
 
         for name, value in campaign.state.simulation.items():
-            if name != "n_iterations" and repr(before.get(name, value)) != repr(value):
+            if name in ("n_iterations", "courses"):
+                continue
+            if repr(before.get(name, value)) != repr(value):
                 raise TrustboError(
                     f"simulator: the campaign was run with {name} = {before[name]!r}, not "
                     f"{value!r}; give the same simulator."

@@ -66,14 +66,13 @@ def _failures(
 
     The bound is its way, the row and column that it enters, and the next way; see `Trials.bounds`.
     """
-    goal = tuple(state.settings["goal"])
     n_posts = planner.workspace.n_posts
-    for number, mission in missions_of_hazard(state, so_far):
+    for number, mission, goal in missions_of_hazard(state, so_far):
         cells = cells_of(mission.path)
         bounds = zip(pairwise(cells), mission.statuses, strict=False)
         failed = {ends: status for ends, status in bounds if status in CAUSES}
         if failed:
-            for bound in _failed(Trials.from_missions([mission], (), goal, n_posts)):
+            for bound in _failed(Trials.from_missions([mission], (), [goal], n_posts)):
                 way, row, col, _ = bound
                 left = _left(way, (row, col))[:2]
                 yield number, failed[left, (row, col)], bound

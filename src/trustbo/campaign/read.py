@@ -20,7 +20,6 @@ from trustbo.campaign.record import (
 )
 from trustbo.campaign.replace import has_campaign, is_being_replaced, recover
 from trustbo.campaign.result import Result
-from trustbo.campaign.settings import to_planner
 from trustbo.campaign.state import Entry, State
 from trustbo.errors import TrustboError, warn
 from trustbo.files import FilePath, to_path
@@ -145,11 +144,11 @@ def load_result(
         >>> result.table()
     """
     state, workspace, _ = read_campaign(directory)
-    if not state.entries:
+    if not state.entries and not state.earlier.missions:
         raise TrustboError(f"the campaign in {str(directory)!r} has no mission; run one first.")
 
     learner = _learner_of(state, model)
-    result = Result(workspace, state, learner, to_planner(state.settings, workspace))
+    result = Result(workspace, state, learner)
     result._progress = progress
     return result
 

@@ -13,7 +13,6 @@ from trustbo.campaign.state import Exclusion, State
 from trustbo.errors import TrustboError, require_whole, warn
 from trustbo.files import FilePath, holding_interrupts
 from trustbo.inference.learner import Learner
-from trustbo.planning import Planner
 from trustbo.workspace import Workspace
 
 
@@ -24,9 +23,9 @@ class Recorder(Result):
         storage: `FolderStorage` of the campaign, or a `MemoryStorage`.
     """
 
-    def __init__(self, workspace: Workspace, state: State, learner: Learner, base: Planner) -> None:
+    def __init__(self, workspace: Workspace, state: State, learner: Learner) -> None:
         """Store the state in memory; see `Result`."""
-        super().__init__(workspace, state, learner, base)
+        super().__init__(workspace, state, learner)
         self.storage: FolderStorage | MemoryStorage = MemoryStorage()
 
     def store_in(self, directory: FilePath, *, overwrite: bool = False) -> None:

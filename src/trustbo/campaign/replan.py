@@ -22,6 +22,7 @@ from trustbo.planning import Plan, Planner
 from trustbo.planning.plan import QUANTILES
 from trustbo.planning.policies import Policy
 from trustbo.planning.problem import Problem
+from trustbo.workspace import Workspace
 
 Pair = tuple[Cell, ...]
 """Cell left and cell entered."""
@@ -47,13 +48,18 @@ class Driven(NamedTuple):
     filter: TrustFilter
 
 
-def trust_filter(result: Result) -> TrustFilter:
-    """Make the filter of a campaign's next mission, from its last posterior or from its prior."""
+def trust_filter(result: Result, workspace: Workspace) -> TrustFilter:
+    """Make the filter of a campaign's next mission, from its last posterior or from its prior.
+
+    Args:
+        result: Campaign.
+        workspace: Workspace of the plan, whose team are the robots that take part.
+    """
     return TrustFilter(
         result.forecast,
-        result.workspace.team.n_robots,
+        workspace.team.n_robots,
         family=result.learner.family,
-        workspace=result.workspace,
+        workspace=workspace,
     )
 
 
@@ -61,7 +67,7 @@ def follow(
     result: Result, plan: Plan, cell: Cell, so_far: Mission | None, blocked: Sequence[Pair]
 ) -> Driven:
     """Follow the bounds of a mission so far; see `Campaign.replan` for the arguments and errors."""
-    workspace = result.workspace
+    workspace = plan.workspace
     closed = [*plan.blocked, *blocked]
     if so_far is None:
         path = _planned(plan.path, cell)
@@ -87,7 +93,7 @@ def follow(
             rates = np.pad(rates, ((0, 1), (0, 0)), constant_values=np.nan)
             n_ticks = np.pad(n_ticks, ((0, 1), (0, 0)), constant_values=np.nan)
 
-    trust = trust_filter(result)
+    trust = trust_filter(result, workspace)
     means = [np.empty((0, *trust.state.mean.shape))]
     sds = list(means)
     for k, bound in enumerate(pairwise(path)):

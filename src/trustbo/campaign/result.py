@@ -1,6 +1,7 @@
 """Result of a campaign: posterior, maps, history and recommended path."""
 
 import threading
+from collections.abc import Callable, Sequence
 from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +12,13 @@ import xarray as xr
 
 from trustbo.campaign.cache import computed
 from trustbo.campaign.choose import informed_planner, instead_of_failure
+from trustbo.campaign.course import Course
 from trustbo.campaign.folder import FolderStorage, without_lost_posteriors
 from trustbo.campaign.learning import fitted_missions, learn_hazard
 from trustbo.campaign.past_failures import with_past_failures
-from trustbo.campaign.state import State
-from trustbo.data import NOWHERE, POST_SETS, Cell, Mission
+from trustbo.campaign.settings import to_planner
+from trustbo.campaign.state import EARLIER, State
+from trustbo.data import NOWHERE, POST_SETS, Cell, Mission, path_text
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_kind
 from trustbo.files import FilePath
@@ -24,9 +27,11 @@ from trustbo.inference.learner import Learner
 from trustbo.inference.score import Posteriors
 from trustbo.models.backend import VERSIONS
 from trustbo.models.draws import Draws, NextMission
+from trustbo.models.families import FAMILIES, Family
 from trustbo.parallel import computing
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.maps import maps_of
+from trustbo.planning.robot_trust import robot_maps, robot_trust
 from trustbo.simulation import Truth
 from trustbo.stacking import padded
 from trustbo.workspace import Workspace
@@ -38,8 +43,13 @@ if TYPE_CHECKING:
 
 _N_PRIOR_DRAWS = 250
 """Number of prior draws for intervals; they contain place effects of all cells, which are large."""
+_MOST_BASES = 4
+"""Number of courses whose planners are kept; those of large maps take much memory."""
 _FIRST_COLUMNS = (
     "mission",
+    "start",
+    "goal",
+    "robots",
     "status",
     "state",
     "reason",
@@ -72,18 +82,18 @@ class Result(Summary):
         >>> result.plot_maps()[0].figure.savefig("maps.png")
     """
 
-    def __init__(self, workspace: Workspace, state: State, learner: Learner, base: Planner) -> None:
-        """Store the state of a campaign; `base` is its planner before any learning."""
+    def __init__(self, workspace: Workspace, state: State, learner: Learner) -> None:
+        """Store the state of a campaign."""
         self.workspace = workspace
         self.state = state
         self.learner = learner
-        self._base = base
+        self._bases: dict[Course, Planner] = {}  # planners before any learning
         self._turn = threading.RLock()
         self._progress = True  # whether slow work shows a progress bar
         self._computed: dict[str, Any] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_turn": None}  # a lock cannot be pickled
+        return vars(self) | {"_turn": None, "_bases": {}}  # a lock cannot be pickled
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -95,9 +105,9 @@ class Result(Summary):
         settings = state.settings
 
         counts = self.table()["state"].value_counts()
-        shown = [f"{number} {name}" for name, number in counts.items()]
+        shown = [f"{number} {name}" for name, number in counts.items() if name != EARLIER]
         rows = [
-            ("course", f"{tuple(settings['start'])} to {tuple(settings['goal'])}"),
+            ("course", self._course_text()),
             ("missions", ", ".join(shown) or "none yet"),
             *self._rows_of_earlier(),
             ("model", settings["model"]),
@@ -105,11 +115,20 @@ class Result(Summary):
         ]
 
         if state.last is not None:
-            best = f"{len(self.path) - 1} bounds, value {self.plan.value:z.3g}"
+            plan = self.plan()
+            where = f"{path_text([plan.start])} to {path_text([plan.goal])}"
+            best = f"{len(plan.path) - 1} bounds from {where}, value {plan.value:z.3g}"
             rows.append(("recommended", best))
         if state.entries and state.last is not None:
             rows.append(("last mission", in_a_line(state.row(len(state.entries) - 1))))
         return rows
+
+    def _course_text(self) -> str:
+        """Describe the course of the campaign, or the courses of its missions."""
+        if self._own_ends is not None:
+            return " to ".join(map(str, self._own_ends))
+        n = len({entry.course.ends for entry in self.state.entries})
+        return f"{n} courses, one for each mission" if n else "any; give start and goal to ask"
 
     def _rows_of_earlier(self) -> Rows:
         missions = self.state.earlier.missions
@@ -139,7 +158,8 @@ class Result(Summary):
     def posteriors(self) -> Posteriors:
         """List of the parameter posteriors after each mission; None where there was none yet."""
         trees = [entry.posterior and entry.posterior() for entry in self.state.entries]
-        return Posteriors(trees, self.missions)
+        initial = self.state.initial
+        return Posteriors(trees, self.missions, initial and initial())
 
     @computed
     def posterior(self) -> xr.DataTree:
@@ -221,34 +241,173 @@ class Result(Summary):
         """Failure probability of each bound, given all missions so far."""
         return BoundRisk(self.hazard, self.workspace)
 
-    @computed
-    def planner(self) -> Planner:
-        """Planner that accounts for the failures so far; see `informed_planner`."""
-        return informed_planner(self._base, self.risk)
+    @property
+    def _own_ends(self) -> tuple[Cell, Cell] | None:
+        """Start and goal that were given to the campaign; None if it has no course of its own."""
+        settings = self.state.settings
+        if settings["start"] is None:
+            return None
+        return tuple(settings["start"]), tuple(settings["goal"])
 
-    def recommend(self) -> Plan:
-        """Plan the best path under the mean of `belief`, regardless of the policy.
+    @property
+    def _last_ends(self) -> tuple[Cell, Cell] | None:
+        """Start and goal of the last plan, or of the last earlier mission on this map."""
+        state = self.state
+        if state.asked is not None:
+            return state.asked.start, state.asked.goal
+        if state.entries:
+            return state.entries[-1].course.ends
+
+        here = [mission.path for mission in state.earlier.missions if not mission.map]
+        return (here[-1][0][:2], here[-1][-1][:2]) if here else None
+
+    def _course(
+        self,
+        start: Location | None,
+        goal: Location | None,
+        robots: Sequence[str] | None,
+        *,
+        usual: tuple[Cell, Cell] | None,
+    ) -> Course:
+        """Return the course with these ends; those of `usual` replace an end that is missing.
+
+        Raises:
+            TrustboError: An end is missing or is not a passable cell, or a robot is unknown.
+        """
+        found = []
+        for k, (name, given) in enumerate({"start": start, "goal": goal}.items()):
+            if given is None and usual is None:
+                raise TrustboError(
+                    f"{name} is missing, and the campaign has no course of its own; give start= "
+                    "and goal=, such as start=(9, 0), goal=(0, 9)."
+                )
+            place: Any = usual[k] if given is None and usual is not None else given
+            found.append(self.workspace.locate(place, name))
+
+        team = self.workspace if robots is None else self.workspace.of_robots(robots)
+        return Course(found[0], found[1], team.team.names)
+
+    def _base_of(self, course: Course) -> Planner:
+        """Return the planner of a course before any learning."""
+        with self._turn:
+            if course not in self._bases:
+                while len(self._bases) >= _MOST_BASES:
+                    del self._bases[next(iter(self._bases))]
+                team = self.workspace.of_robots(course.robots)
+                self._bases[course] = to_planner(self.state.settings, team, *course.ends)
+            return self._bases[course]
+
+    def planner_of(self, course: Course) -> Planner:
+        """Return the planner of a course, which accounts for the failures so far.
+
+        The courses of a campaign are in `courses`. The planner's workspace has the robots that take
+        part.
+        """
+        return self._of_course("planner", course, lambda: self._informed(course))
+
+    def _informed(self, course: Course) -> Planner:
+        return informed_planner(self._base_of(course), self.risk)
+
+    def _of_course[T](self, name: str, course: Course, compute: Callable[[], T]) -> T:
+        """Return a value of a course, which is computed once until something is recorded."""
+        with self._turn:
+            of_courses = self._computed.setdefault(name, {})
+            if course not in of_courses:
+                of_courses[course] = compute()
+            return of_courses[course]
+
+    def _shown(
+        self,
+        start: Location | None = None,
+        goal: Location | None = None,
+        robots: Sequence[str] | None = None,
+    ) -> Course:
+        """Return a course to be shown: by default the campaign's own, or else the last one."""
+        usual = self._own_ends or self._last_ends
+        return self._course(start, goal, robots, usual=usual)
+
+    @property
+    def planner(self) -> Planner:
+        """Planner of the course of `plan()`, which accounts for the failures so far."""
+        return self.planner_of(self._shown())
+
+    def recommend(
+        self,
+        start: Location | None = None,
+        goal: Location | None = None,
+        *,
+        robots: Sequence[str] | None = None,
+    ) -> Plan:
+        """Plan the best path under the mean of `belief`, regardless of the policy, without bands.
 
         If no path satisfies `max_failure`, or the best one almost certainly fails, the safest path
-        is returned.
+        is returned. The arguments are those of `plan`.
         """
-        mean = self.belief.mean()
-        try:
-            plan = self.planner.plan(mean)
-        except InfeasibleError as error:
-            return self.planner.evaluate(error.path, mean)
-        return instead_of_failure(self.planner, plan, self.belief)
+        return self._recommended(self._shown(start, goal, robots))
 
-    @computed
-    def plan(self) -> Plan:
-        """Recommended plan, the best under the posterior mean, with posterior credible bands."""
-        best = with_past_failures(self.recommend(), self.state, self.planner)
-        return best.with_draws(self.planner.evaluate(best.path, self.forecast))
+    def _recommended(self, course: Course) -> Plan:
+        planner = self.planner_of(course)
+        belief = self._belief_of(course)
+        mean = belief.mean()
+        try:
+            plan = planner.plan(mean)
+        except InfeasibleError as error:
+            return planner.evaluate(error.path, mean)
+        return instead_of_failure(planner, plan, belief)
+
+    def plan(
+        self,
+        start: Location | None = None,
+        goal: Location | None = None,
+        *,
+        robots: Sequence[str] | None = None,
+    ) -> Plan:
+        """Recommend a path, the best under the posterior mean, with posterior credible bands.
+
+        Nothing is recorded. `Campaign.ask` returns the next path to run, which a policy chooses.
+
+        Args:
+            start: First cell, or a position in this cell; see `Workspace.locate`. By default, the
+                start of the campaign or, if it has no course of its own, of the last mission.
+            goal: Last cell, or a position in this cell, with the same default.
+            robots: Names of the robots that take part; by default the whole team.
+
+        Raises:
+            TrustboError: No course is known, a cell is not passable, or a robot is unknown.
+            NoPathError: The goal cannot be reached.
+
+        Example:
+            >>> result.plan().path == result.path
+            True
+            >>> result.plan(start=(0, 0), goal=(9, 9), robots=("r1", "r3")).trust.shape[1]
+            2
+        """
+        course = self._shown(start, goal, robots)
+        return self._of_course("plan", course, lambda: self._with_bands(course))
+
+    def _with_bands(self, course: Course) -> Plan:
+        planner = self.planner_of(course)
+        best = with_past_failures(self._recommended(course), self.state, planner)
+        return best.with_draws(planner.evaluate(best.path, self.forecast))
 
     @property
     def path(self) -> list[Cell]:
-        """Recommended path."""
-        return list(self.plan.path)
+        """Recommended path, that of `plan()`."""
+        return list(self.plan().path)
+
+    def _belief_of(self, course: Course) -> Draws:
+        """Return the draws of `belief` for the robots that take part."""
+        if course.robots == self.workspace.team.names:
+            return self.belief
+        return self.belief.in_order(course.robots, self.workspace.features)
+
+    @property
+    def courses(self) -> list[Course]:
+        """Courses of all missions and of the plan that is asked for, each once, in order."""
+        plans = [entry.plan for entry in self.state.entries]
+        if self.state.asked is not None:
+            plans.append(self.state.asked)
+        return list(dict.fromkeys(Course.of(plan) for plan in plans))
 
     def trust(
         self,
@@ -298,7 +457,13 @@ class Result(Summary):
             >>> float(trust.mean()), float(trust.std())
         """
         draws = self._ahead.of_robots(expected=expected)
-        return self._base.trust(draws, robot, cell, move=move, posts=posts, as_rate=as_rate)
+        about = {"move": move, "posts": posts, "as_rate": as_rate}
+        return robot_trust(self.workspace, self._rates, draws, robot, cell, **about)
+
+    @property
+    def _rates(self) -> Family:
+        """Observation family of the contact rates."""
+        return FAMILIES[self.state.settings["family"]]
 
     def compare_posts(self) -> pd.DataFrame:
         """Compare the sets of posts in each bound of the recommended path.
@@ -309,7 +474,7 @@ class Result(Summary):
         Example:
             >>> result.compare_posts().query("chosen")
         """
-        return self.planner.compare_posts(self.plan.path, self.belief)
+        return self.planner.compare_posts(self.path, self.belief)
 
     def robot_maps(self, *, expected: bool = False) -> xr.Dataset:
         """Compute maps of the trust in each robot in the next mission.
@@ -322,48 +487,77 @@ class Result(Summary):
             Dataset with the dims (robot, y, x) of the mean `trust_mean` and standard deviation
             `trust_sd` of trust, and the mean `contact_rate`; see `planning.Planner.robot_maps`.
         """
-        return self._base.robot_maps(self._ahead.of_robots(expected=expected))
+        return robot_maps(self.workspace, self._rates, self._ahead.of_robots(expected=expected))
 
-    @computed
+    @property
     def trust_map(self) -> xr.DataArray:
-        """Trust map of the team after the last mission, dims (row, col)."""
-        return self.planner.trust_map(self.belief.mean())
+        """Trust map of the team after the last mission, dims (row, col).
+
+        It begins at the start of the course of `plan()`.
+        """
+        return self._trust_map_of(self._shown())
+
+    def _trust_map_of(self, course: Course) -> xr.DataArray:
+        """Return the trust map of a course, from its start."""
+
+        def compute() -> xr.DataArray:
+            return self.planner_of(course).trust_map(self._belief_of(course).mean())
+
+        return self._of_course("trust_map", course, compute)
 
     @computed
     def history(self) -> xr.Dataset:
         """Dataset of the quantities of each mission, with dim `iteration` (1, 2, ...).
 
         It contains the planned `path` (row and col of each step, -1 after the goal), the
-        `trust_map` used for planning, and the numbers and texts of `table`. With several sets of
-        posts, it contains the number of the set, `posts`, of each bound (-1 after the last). The
-        attribute `objective` is the name of the objective. Raises TrustboError if there is no
-        mission yet.
+        `trust_map` used for planning, from the start of the mission, and the numbers and texts of
+        `table`. With several sets of posts, it contains the number of the set, `posts`, of each
+        bound (-1 after the last). The attribute `objective` is the name of the objective. Missions
+        of earlier campaigns on this map come first; they have negative numbers and no trust map.
+        Raises TrustboError if there is no mission yet.
         """
-        entries = self.state.entries
-        if not entries:
+        state = self.state
+        earlier = state.earlier_here
+        if not state.entries and not earlier:
             raise TrustboError("the campaign has no mission yet; call tell or run first.")
 
-        paths = [cells_along(entry.plan.path).tolist() for entry in entries]
-        steps = np.stack([*zip_longest(*paths, fillvalue=NOWHERE)], axis=1)
-        numbers = pd.RangeIndex(1, len(paths) + 1, name="iteration")
-        table = pd.DataFrame([self.state.row(j) for j in range(len(entries))], numbers)
+        rows = {label: state.earlier_row(i) for label, i in earlier.items()}
+        planned = [state.earlier.planned[i] for i in earlier.values()]
+        driven = [state.earlier.missions[i].path for i in earlier.values()]
+        stations = [(one or (path,))[0] for one, path in zip(planned, driven, strict=True)]
+        like = state.entries[0].trust_map if state.entries else self.workspace.passable
+        maps = [xr.full_like(like, np.nan, dtype=float)] * len(rows)
 
-        history = table.drop(columns=["where", "failed_bounds", "n_bounds", "path"]).to_xarray()
+        for j, entry in enumerate(state.entries):
+            rows[j + 1] = state.row(j)
+            stations.append(entry.plan.path)
+            maps.append(entry.trust_map)
+
+        paths = [cells_along(path).tolist() for path in stations]
+        steps = np.stack([*zip_longest(*paths, fillvalue=NOWHERE)], axis=1)
+        numbers = pd.Index([*rows], name="iteration")
+        table = pd.DataFrame([*rows.values()], numbers)
+
+        text = [name for name in ("where", "failed_bounds", "n_bounds", "path") if name in table]
+        history = table.drop(columns=text).to_xarray()
         history["path"] = ("iteration", "step", "axis"), steps
         if self.workspace.n_posts > 1:
-            sets = [posts_along(entry.plan.path) for entry in entries]
+            sets = [posts_along(path) for path in stations]
             history["posts"] = ("iteration", "bound"), padded(sets, -1)
-        history["trust_map"] = xr.concat([entry.trust_map for entry in entries], numbers)
+        history["trust_map"] = xr.concat(maps, numbers, combine_attrs="drop")
         history.attrs["objective"] = self.settings["objective"]
         return history.assign_coords(axis=["row", "col"])
 
     def table(self) -> pd.DataFrame:
         """Return a table with one row per mission, labelled by its number, from 1.
 
-        Missions given up with `Campaign.fail` have no number. The columns are:
+        Missions given up with `Campaign.fail` have no number. Missions of earlier campaigns on this
+        map come first and have the negative numbers that they have in `posterior`. The columns are:
 
+        - `start`, `goal`: first and last cell of the plan, such as "9,0".
+        - `robots`: robots that took part.
         - `status`: status of the mission.
-        - `state`: "told" (not used yet), "learned", "excluded" or "given up".
+        - `state`: "told" (not used yet), "learned", "excluded", "given up" or "earlier".
         - `reason`: reason for the state or the failure; otherwise, the statuses of bounds that were
           not completed.
         - `where`: cells where a bound failed.
@@ -378,6 +572,7 @@ class Result(Summary):
         - `contact_lost`: contact lost, in bounds: the sum over bounds of 1 minus the mean contact
           rate of the measured robots. Bounds without any rate count as the mean of the mission's
           measured bounds, and bounds that were not run lose all contact.
+        - `lost_share`: contact lost, as a share of the bounds of the mission.
         - Diagnostics of the posterior; see `fit`.
         """
         state = self.state
@@ -385,6 +580,8 @@ class Result(Summary):
         for i, failure in enumerate(state.failures):  # after the mission that precedes it
             rows.insert(failure.after + i, failure.row())
 
+        earlier = state.earlier_here.items()
+        rows = [*(state.earlier_row(i) | {"mission": label} for label, i in earlier), *rows]
         columns = dict.fromkeys([*_FIRST_COLUMNS, *chain(*rows)])
         table = pd.DataFrame(rows, columns=list(columns))
         return table.astype({"mission": "Int64"}).set_index("mission")
@@ -442,10 +639,11 @@ class Result(Summary):
         if truth is not None:
             require_kind("truth", truth, Truth, "give simulation.Truth.from_simulator(simulator)")
 
-            longest = self.planner.max_bounds
+            longest = self.state.settings["max_bounds"]
             paths = [entry.plan.path for entry in self.state.entries]
             regret = [truth.at(n).regret(path, longest) for n, path in enumerate(paths)]
-            history = history.assign(regret=("iteration", regret))
+            unknown = [np.nan] * (history.sizes["iteration"] - len(paths))  # earlier missions
+            history = history.assign(regret=("iteration", [*unknown, *regret]))
         return campaign_history(history, **options)
 
     def explore(self) -> "Explorer":
@@ -456,7 +654,7 @@ class Result(Summary):
         """
         from trustbo import plots
 
-        return plots.explore(self.plan, self.maps(), self.history)
+        return plots.explore(self.plan(), self.maps(), self.history)
 
     def save(self, directory: FilePath, *, overwrite: bool = False) -> None:
         """Write the campaign to a folder that `load_result` and `Campaign.load` read.

@@ -14,6 +14,7 @@ from trustbo.inference.learner import Learner
 from trustbo.planning import Planner
 from trustbo.planning.policies import POLICIES, Policy
 from trustbo.workspace import Workspace
+from trustbo.workspace.grid import Location
 
 _UNCHANGED = ("objective", "sampler", "seed", "initial", "awareness", "planner", "fit")
 """Arguments of `Campaign` that are stored unchanged."""
@@ -73,15 +74,22 @@ def _require_options(
 
 
 def to_settings(
-    base: Planner, learner: Learner, policy: str | Policy, hazard: Hazard, **options: Any
+    base: Planner,
+    learner: Learner,
+    policy: str | Policy,
+    hazard: Hazard,
+    *,
+    has_course: bool,
+    **options: Any,
 ) -> dict[str, Any]:
     """Return the settings of a campaign as if they were read from a file.
 
     Args:
-        base: Planner before any learning.
+        base: Planner of any course, before any learning.
         learner: Learner of the model.
         policy: Policy that chooses the paths.
         hazard: Priors of the failure probabilities.
+        has_course: Whether the course of `base` is that of the campaign.
         **options: Other arguments of `Campaign`, which are stored unchanged: `objective`,
             `sampler`, `seed`, `initial`, `awareness`, `planner` and `fit`.
 
@@ -95,8 +103,8 @@ def to_settings(
         options[name] = to_plain(name, options[name])
 
     settings = {
-        "start": base.start,
-        "goal": base.goal,
+        "start": base.start if has_course else None,
+        "goal": base.goal if has_course else None,
         "max_bounds": base.max_bounds,
         "policy": _text_of(policy),
         **options,
@@ -134,12 +142,14 @@ def to_arguments(settings: Mapping[str, Any], policy: Policy | None) -> dict[str
     }
 
 
-def to_planner(settings: Mapping[str, Any], workspace: Workspace) -> Planner:
-    """Make the planner of a campaign before any learning."""
+def to_planner(
+    settings: Mapping[str, Any], workspace: Workspace, start: Location, goal: Location
+) -> Planner:
+    """Make the planner of a course before any learning, for the robots of the workspace."""
     return Planner(
         workspace,
-        settings["start"],
-        settings["goal"],
+        start,
+        goal,
         settings["objective"],
         family=settings["family"],
         **settings["planner"],

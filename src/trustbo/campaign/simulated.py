@@ -1,13 +1,13 @@
 """Missions of a campaign in a simulator."""
 
 import json
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
 from trustbo.campaign.result import Result, in_a_line
 from trustbo.campaign.settings import name_of
 from trustbo.campaign.stopping import Stop
-from trustbo.data import Mission
+from trustbo.data import Cell, Mission
 from trustbo.display import bar as progress_bar
 from trustbo.display import refreshing
 from trustbo.errors import TrustboError
@@ -35,28 +35,37 @@ def require_simulator(campaign: Result, simulator: Simulator | None) -> Simulato
     return simulator
 
 
-def settings_of(simulator: Simulator, n_iterations: int) -> dict[str, Any]:
+def settings_of(
+    simulator: Simulator, n_iterations: int, courses: Sequence[tuple[Cell, Cell]]
+) -> dict[str, Any]:
     """Return the settings of a simulation as if they were read from a file."""
     describe = getattr(simulator, "describe", lambda: {"simulator": type(simulator).__name__})
-    return json.loads(to_json({**describe(), "n_iterations": n_iterations}))
+    settings = {**describe(), "n_iterations": n_iterations}
+    if courses:
+        settings["courses"] = courses
+    return json.loads(to_json(settings))
 
 
 def run_missions(
     campaign: Result,
-    ask: Callable[[], Plan],
+    ask: Callable[..., Plan],
     tell: Callable[..., Any],
     simulator: Simulator,
     n_iterations: int,
+    courses: Sequence[tuple[Cell, Cell]],
     stop: Stop | None,
     progress: bool,
 ) -> Generator[tuple[Plan, Mission], None, str]:
-    """Run missions for `Campaign.run`; returns the reason why they ended."""
+    """Run missions for `Campaign.run`; returns the reason why they ended.
+
+    Without `courses`, all missions have the course of the campaign.
+    """
     options = {"total": n_iterations, "initial": len(campaign.missions), "desc": "missions"}
     with progress_bar(progress, **options) as bar, refreshing(bar):
         # Check the rule before each mission: it may already apply when a campaign is resumed.
         while not (reason := _reason_to_end(campaign, n_iterations, stop)):
-            plan = ask()
             n = len(campaign.state.entries)
+            plan = ask(*courses[n % len(courses)]) if courses else ask()
             seed = campaign.state.seed_of("mission")
             mission = simulator.run(plan.path, seed=seed, mission=n)
             tell(mission, again=True)  # a simulator without noise may repeat itself

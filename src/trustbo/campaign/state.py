@@ -1,5 +1,6 @@
 """State of a campaign: missions with plans and posteriors, and missions given up."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -8,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Cell, Mission, cells_of, path_text
+from trustbo.campaign.course import Course
+from trustbo.data import Cell, Mission, Station, cells_of, path_text
 from trustbo.errors import TrustboError
 from trustbo.files import read_file
 from trustbo.hazard.trials import LostMission
@@ -23,6 +25,8 @@ EXCLUDED = "excluded"
 """State of a mission that is not used for learning."""
 GIVEN_UP = "given up"
 """State of a mission without data."""
+EARLIER = "earlier"
+"""State of a mission of an earlier campaign, which every fit uses."""
 _STREAMS = ("policy", "fit", "mission", "prior", "awareness", "hazard", "exclude")
 """Random streams; the seeds depend on their order, so add new names at the end."""
 
@@ -53,7 +57,10 @@ class Failure(NamedTuple):
     def row(self) -> dict[str, Any]:
         """Return the failure's row in the table of missions."""
         where = "" if self.where is None else path_text([self.where])
+        ends = self.path[:1] + self.path[-1:]
+        course = {n: path_text([a[:2]]) for n, a in zip(("start", "goal"), ends, strict=False)}
         return {
+            **course,
             "status": self.reason if self.path else "aborted",
             "state": EXCLUDED if self.withdrawn else GIVEN_UP,
             "reason": self.withdrawn or self.reason,
@@ -140,6 +147,36 @@ class Exclusion(NamedTuple):
     reason: str
 
 
+def measures_of(mission: Mission, path: Sequence[Station]) -> dict[str, Any]:
+    """Return what a mission measured on a planned path, by column of `Result.table`."""
+    n_planned = len(mission.path) - 1
+    if mission.path[-1][:2] != path[-1][:2]:  # the path no longer contained the goal
+        n_planned = max(n_planned, len(path) - 1)
+    rates = mission.contact_rate
+    failed = [cell for _, cell, _ in incomplete_bounds(mission)]
+    contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
+    lost = _contact_lost(rates, n_planned)
+
+    return {
+        "contact_rate": contact,
+        "contact_lost": lost,
+        "lost_share": lost / n_planned,
+        "status": mission.status,
+        "where": path_text(failed),
+        "failed_bounds": failed_bounds_text(mission),
+        "n_bounds": len(mission.bounds),
+        "n_unmeasured": int(np.isnan(rates).all(axis=1).sum()),
+        "path": path_text(path),
+    }
+
+
+def failed_bounds_text(mission: Mission) -> str:
+    """Describe the bounds that were not completed, such as "2 into 1,2 (stuck)"."""
+    return ", ".join(
+        f"{k} into {path_text([cell])} ({status})" for k, cell, status in incomplete_bounds(mission)
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Entry:
     """Recorded mission, with its plan and the posterior after it.
@@ -160,6 +197,11 @@ class Entry:
     exclusion: Exclusion | None = None
     posterior: Posterior | None = None
 
+    @property
+    def course(self) -> Course:
+        """Course of the plan."""
+        return Course.of(self.plan)
+
     @cached_property
     def why_excluded(self) -> str | None:
         """Reason why the mission is not used for learning; None if it is used."""
@@ -170,26 +212,17 @@ class Entry:
     @cached_property
     def measures(self) -> dict[str, Any]:
         """Values of the mission in `Result.table`, by column, that depend on nothing else."""
-        plan = self.plan
-        mission = self.mission
+        of_mission = measures_of(self.mission, self.plan.path)
+        return self.course.to_row() | of_mission | {"objective": self.plan.value}
 
-        n_planned = len(mission.path) - 1
-        if mission.path[-1][:2] != plan.path[-1][:2]:  # the path no longer contained the goal
-            n_planned = max(n_planned, len(plan.path) - 1)
-        rates = mission.contact_rate
-        failed = [cell for _, cell, _ in incomplete_bounds(mission)]
-        contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
 
-        return {
-            "objective": plan.value,
-            "contact_rate": contact,
-            "contact_lost": _contact_lost(rates, n_planned),
-            "status": mission.status,
-            "where": path_text(failed),
-            "n_bounds": len(mission.bounds),
-            "n_unmeasured": int(np.isnan(rates).all(axis=1).sum()),
-            "path": path_text(plan.path),
-        }
+type Planned = tuple[tuple[Station, ...], ...]
+"""Planned path of a mission, and then those on which a bound failed; empty if not known."""
+
+
+def planned_paths(plan: Plan) -> Planned:
+    """Return the planned paths of a mission."""
+    return (plan.path, *plan.abandoned)
 
 
 class EarlierMissions(NamedTuple):
@@ -198,10 +231,12 @@ class EarlierMissions(NamedTuple):
     Attributes:
         missions: Measured missions with the awareness used for learning. All have the same robots:
             those of the campaign, followed by the others.
+        planned: Planned paths of each mission.
         lost: Missions without measurements in which a bound of the campaign's map failed.
     """
 
     missions: tuple[Mission, ...] = ()
+    planned: tuple[Planned, ...] = ()
     lost: tuple[LostMission, ...] = ()
 
 
@@ -273,6 +308,35 @@ class State:
             return LEARNED, ""
         return TOLD, self.why_not
 
+    @property
+    def earlier_here(self) -> dict[int, int]:
+        """Indices of the earlier missions on this map that teach trust, by their label.
+
+        The labels are negative, -1 for the last of all earlier missions that teach trust.
+        """
+        missions = self.earlier.missions
+        usable = [i for i, mission in enumerate(missions) if not why_never_learned(mission)]
+        labelled = zip(range(-len(usable), 0), usable, strict=True)
+        return {label: i for label, i in labelled if not missions[i].map}
+
+    def earlier_row(self, i: int) -> dict[str, Any]:
+        """Return the row in `Result.table` of the earlier mission with index i."""
+        mission = self.earlier.missions[i]
+        planned = self.earlier.planned[i] or (mission.path,)
+        path = planned[0]
+
+        measured = np.isfinite(mission.contact_rate).any(0)
+        went = tuple(n for n, known in zip(mission.robots, measured, strict=True) if known)
+        return {
+            **Course(path[0][:2], path[-1][:2], went).to_row(),
+            **measures_of(mission, path),
+            "state": EARLIER,
+            "reason": ", ".join(dict.fromkeys(one for _, _, one in incomplete_bounds(mission))),
+            "objective": np.nan,
+            "path_changed": False,
+            "replanned": len(planned) > 1,
+        }
+
     def row(self, j: int) -> dict[str, Any]:
         """Return the row of the mission with index j in `Result.table`.
 
@@ -293,9 +357,6 @@ class State:
             "replanned": entry.plan.is_replanned,
             "state": state,
             "reason": reason,
-            "failed_bounds": ", ".join(
-                f"{k} into {path_text([cell])} ({status})" for k, cell, status in failed
-            ),
             **(posterior.diagnostics if posterior and is_own else {}),
         }
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from trustbo.campaign.course import Course
 from trustbo.campaign.result import Result
 from trustbo.errors import TrustboError, require_share
 from trustbo.planning import InfeasibleError
@@ -34,7 +35,8 @@ class RegretBound:
     value. From the third mission on, the campaign stops if two conditions hold: P(regret <= eps) >=
     1 - delta after each of the last two missions, and every bound of the recommended path has been
     completed at least once, with its sets of posts. The second condition is needed because the map
-    may be wrong about bounds that no robot has driven.
+    may be wrong about bounds that no robot has driven. In a campaign with several courses, both
+    conditions must hold for each course on which missions were run.
 
     Attributes:
         eps: Acceptable regret, as a fraction; 0.05 is 5 %.
@@ -62,25 +64,33 @@ class RegretBound:
         if n <= _N_SURE:
             return None
 
-        sure = [self.probability(campaign, n - k) for k in range(_N_SURE)]
-        if min(sure) < 1.0 - self.delta:
-            return None
-
         risk = campaign.risk
-        bounds = tuple(risk.pairs_along(campaign.recommend().path).T)
-        was_completed = risk.trials[bounds] > risk.failures[bounds]
-        if not was_completed.all():
-            return None
-        return f"regret_bound: P(regret <= {self.eps:g}) = {sure[0]:.3f} >= {1.0 - self.delta:g}"
+        least = 1.0
+        for course in dict.fromkeys(entry.course for entry in campaign.state.entries):
+            sure = [self.probability(campaign, n - k, course) for k in range(_N_SURE)]
+            if min(sure) < 1.0 - self.delta:
+                return None
 
-    def probability(self, campaign: Result, n_missions: int) -> float:
-        """Compute P(regret of the recommended path <= eps) after the first `n_missions`."""
+            best = campaign.recommend(*course.ends, robots=course.robots)
+            bounds = tuple(risk.pairs_along(best.path).T)
+            was_completed = risk.trials[bounds] > risk.failures[bounds]
+            if not was_completed.all():
+                return None
+            least = min(least, sure[0])
+        return f"regret_bound: P(regret <= {self.eps:g}) = {least:.3f} >= {1.0 - self.delta:g}"
+
+    def probability(self, campaign: Result, n_missions: int, course: Course | None = None) -> float:
+        """Compute P(regret of the recommended path <= eps) after the first `n_missions`.
+
+        The path is that of a course of the campaign, by default the one of `Result.plan`.
+        """
         posterior = campaign.state.entries[n_missions - 1].posterior
         if posterior is None:
             return 0.0
 
-        planner = campaign.planner
+        planner = campaign.planner if course is None else campaign.planner_of(course)
         draws = campaign.learner.draws(posterior(), campaign.workspace)
+        draws = draws.in_order(planner.workspace.team.names, planner.workspace.features)
         try:
             path = planner.plan(draws.mean()).path
             drawn = planner.plan_draws(draws, n_draws=_N_DRAWS)

@@ -57,7 +57,8 @@ class Check(Summary):
         table: One row per check (index `check`). The columns are the text of the `finding`, whether
             it `stands_out`, the most affected `label`, and the `size` and `probability` of the
             effect.
-        robots: One row per `mission` (counted from 1) and `robot`. The columns are the `effect`
+        robots: One row per `mission` (counted from 1; negative for earlier campaigns) and `robot`.
+            The columns are the `effect`
             (share of line of sight minus the median), its `sd`, the `probability` that it is below
             -.1 or above .1, whichever is larger, and `stands_out`. With two robots, the effect is
             the difference from the other robot in the same mission, so the two rows of a mission
@@ -196,8 +197,11 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
         effect = effect - effect.median(("mission", "robot"))
     effect = effect / FAMILIES[posterior.attrs["family"]].line_of_sight[0]
 
-    # Missions of earlier campaigns, which have negative indices, only serve as a reference.
-    effect = effect.isel(mission=effect["mission"] >= 0)
+    # Missions of earlier campaigns, which have negative indices, only serve as a reference for the
+    # campaign's own missions, if there are any.
+    is_own = effect["mission"] >= 0
+    if is_own.any():
+        effect = effect.isel(mission=is_own)
     # Sums have the same rounding errors for any order of the axes in memory.
     effect = effect.copy(data=np.ascontiguousarray(effect))
 
@@ -206,7 +210,7 @@ def effects_of_robots(posterior: xr.DataTree) -> pd.DataFrame:
     columns = {"effect": effect.mean(_OF_DRAWS), "sd": effect.std(_OF_DRAWS)}
     columns["probability"] = less.where(less > more, more)
     table = xr.Dataset(columns).to_dataframe(["mission", "robot"]).reset_index()
-    table["mission"] += 1
+    table["mission"] += table["mission"] >= 0
     return table.assign(stands_out=table["probability"] > SURE)
 
 

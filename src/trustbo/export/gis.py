@@ -96,10 +96,10 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
         TrustboError: The workspace has no CRS, or the file cannot be written.
 
     Example:
-        >>> tb.export.write_geojson("path.geojson", result.plan)
+        >>> tb.export.write_geojson("path.geojson", result.plan())
     """
     name = "recommended path" if isinstance(plan, Result) else "planned path"
-    plan = plan.plan if isinstance(plan, Result) else plan
+    plan = plan.plan() if isinstance(plan, Result) else plan
     require_kind("plan", plan, Plan, "give a Plan, for example from Campaign.ask, or a Result")
     facts = {"name": name, "n_bounds": len(plan.path) - 1, "n_driven": plan.n_driven}
     facts |= {"value": float(plan.value), "objective": plan.objective}
@@ -135,7 +135,8 @@ def write_csv(path: FilePath, result: Result) -> None:
 
     The table has the columns of `logs.to_frame`, and `trust_mean` and `trust_sd`: the mean and
     standard deviation of latent trust under the last posterior. Missing measurements are blank, and
-    so is the trust in missions that are not in the last posterior.
+    so is the trust in missions that are not in the last posterior. Missions of earlier campaigns on
+    this map come first, with the negative numbers of `Result.table`.
 
     Args:
         path: File to write or replace.
@@ -149,11 +150,17 @@ def write_csv(path: FilePath, result: Result) -> None:
         >>> tb.export.write_csv("missions.csv", result)
     """
     require_kind("result", result, Result, "give a result or a campaign")
-    table = to_frame(result.missions)
     latent = result.posterior["latent"].to_dataset()[["trust_mean", "trust_sd"]]
 
+    earlier = result.state.earlier_here
+    missions = [result.state.earlier.missions[i] for i in earlier.values()]
+    labels = [*earlier, *range(1, len(result.missions) + 1)]
+    table = to_frame([*missions, *result.missions])
+    table["mission"] = np.array(labels)[table["mission"] - 1]
+
     # The posterior lacks missions that are excluded or not learned from yet.
-    numbered = latent.assign_coords(mission=latent["mission"] + 1)
+    label = latent["mission"].values
+    numbered = latent.assign_coords(mission=np.where(label < 0, label, label + 1))
     keys = ["mission", "bound", "robot"]
     trust = numbered.to_dataframe(dim_order=keys)[["trust_mean", "trust_sd"]]
     write_text(path, table.join(trust, on=keys).to_csv(index=False, lineterminator="\n"))

@@ -165,7 +165,7 @@ def write_nav2(
     if frame is not None:
         require_kind("frame", frame, Frame, "give a trustbo.export.Frame")
     folder = to_path(folder)
-    plan = result.plan if isinstance(result, Result) else result
+    plan = result.plan() if isinstance(result, Result) else result
     workspace = result.workspace
     place = Frame(workspace.grid.center(plan.path[0][:2])) if frame is None else frame
 

@@ -18,13 +18,20 @@ imputation; Kong, Liu and Wong 1994), and the weights are corrected for the join
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import xarray as xr
 from scipy import special, stats
 
 from trustbo.data import Cell, Mission, require_map
-from trustbo.errors import PosteriorError, TrustboError, require_whole
+from trustbo.errors import (
+    PosteriorError,
+    TrustboError,
+    require_list,
+    require_pair,
+    require_whole,
+)
 from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, BoundPrior, Hazard
 from trustbo.hazard.risk import add_lost
 from trustbo.hazard.trials import LostMission, Trials
@@ -64,7 +71,7 @@ def fit_hazard(
     hazard: Hazard | None = None,
     *,
     lost: Iterable[LostMission] = (),
-    goal: Cell | None = None,
+    goals: Sequence[Cell | None] | None = None,
     seed: int = 0,
 ) -> xr.Dataset:
     """Fit the hazard model to missions by importance sampling.
@@ -77,8 +84,9 @@ def fit_hazard(
             Without a terrain, all bounds have the same prior mean.
         hazard: Priors; by default `Hazard()`.
         lost: Failed missions without measurements.
-        goal: Last cell of all planned paths, if they have the same one. Otherwise, it is unknown
-            whether a path that ends at a bound that failed was planned to end there.
+        goals: Last cell of the planned path of each mission, or None where it is not known; by
+            default, none is known. Without it, it is unknown whether a path that ends at a bound
+            that failed was planned to end there.
         seed: Random seed; the same seed gives the same posterior.
 
     Returns:
@@ -114,7 +122,7 @@ def fit_hazard(
             )
 
     n_posts = workspace.n_posts
-    trials = Trials.from_missions(missions, lost, goal, n_posts)
+    trials = Trials.from_missions(missions, lost, _goals_of(missions, goals), n_posts)
     difficulty = workspace.difficulty
     shape = difficulty.exists.shape[1:3]
     cells = trials.bounds[:, 1:3]
@@ -146,6 +154,18 @@ def fit_hazard(
         raise PosteriorError(reason, group, "Use more informative priors in Hazard(...).")
 
     return group
+
+
+def _goals_of(missions: Sequence[Mission], goals: Any) -> list[Cell | None]:
+    """Return the goal of each mission; raises TrustboError unless there is one for each."""
+    if goals is None:
+        return [None] * len(missions)
+
+    remedy = "give a list with one cell (row, col), or None, for each mission"
+    given = require_list("goals", goals, remedy=remedy)
+    if len(given) != len(missions):
+        raise TrustboError(f"goals must have {len(missions)} entries; got {len(given)}. {remedy}.")
+    return [None if goal is None else require_pair("a goal", goal) for goal in given]
 
 
 def sample(

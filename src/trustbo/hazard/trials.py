@@ -59,7 +59,7 @@ class Trials(NamedTuple):
         cls,
         missions: Iterable[Mission],
         lost: Iterable[LostMission] = (),
-        goal: Cell | None = None,
+        goals: Sequence[Cell | None] | None = None,
         n_posts: int = 1,
     ) -> Self:
         """Count the trials in measured missions and in lost missions.
@@ -71,15 +71,20 @@ class Trials(NamedTuple):
         Args:
             missions: Measured missions.
             lost: Failed missions without measurements.
-            goal: Last cell of all planned paths, if they have the same one. A path that ends in
-                another cell at a bound that failed has an unknown next way.
+            goals: Last cell of the planned path of each measured mission, or None where it is not
+                known; by default, none is known. A path that ends in another cell at a bound that
+                failed has an unknown next way.
             n_posts: Number of sets of posts. Other sets in paths count as the standard one.
 
         Raises:
             TrustboError: If a path skips cells or does not enter `where`.
         """
         lost = require_list("lost", lost, LostMission, "give a list of LostMission")
-        known = [_reported(mission, goal, n_posts) for mission in list_of_missions(missions)]
+        missions = list_of_missions(missions)
+        goals = [None] * len(missions) if goals is None else goals
+        of_missions = zip(missions, goals, strict=True)
+
+        known = [_reported(mission, goal, n_posts) for mission, goal in of_missions]
         known += [_located(mission, n_posts) for mission in lost if mission.where is not None]
         unknown = [_pairs_along(one.path, n_posts) for one in lost if one.where is None]
 

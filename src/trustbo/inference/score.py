@@ -27,14 +27,20 @@ class Posteriors(list[xr.DataTree | None]):
 
     Attributes:
         missions: All missions of the campaign, in order.
+        initial: Posterior before the first mission, given those of earlier campaigns; None if
+            there are none.
     """
 
     def __init__(
-        self, posteriors: Iterable[xr.DataTree | None], missions: Iterable[Mission]
+        self,
+        posteriors: Iterable[xr.DataTree | None],
+        missions: Iterable[Mission],
+        initial: xr.DataTree | None = None,
     ) -> None:
         """Store the missions and the posteriors, which are None where there was none yet."""
         super().__init__(posteriors)
         self.missions = list_of_missions(missions)
+        self.initial = initial
 
     def __repr__(self) -> str:
         n_learned = sum(tree is not None for tree in self)
@@ -242,7 +248,8 @@ def predictions(
 
 def last_posterior(who: str, posteriors: Sequence[xr.DataTree | None]) -> xr.DataTree:
     """Return the last posterior of a campaign; raise TrustboError if there is none yet."""
-    trees = [tree for tree in posteriors if tree is not None]
+    initial = posteriors.initial if isinstance(posteriors, Posteriors) else None
+    trees = [tree for tree in (initial, *posteriors) if tree is not None]
     if not trees:
         raise TrustboError(
             f"{who} needs a posterior, but nothing has been learned yet; run a mission with "

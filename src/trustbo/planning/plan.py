@@ -173,6 +173,16 @@ class Plan(Summary):
         return {column: value[:, robots].mean(1) for column, value in values.items()}
 
     @property
+    def start(self) -> Cell:
+        """First cell of the path."""
+        return self.path[0][:2]
+
+    @property
+    def goal(self) -> Cell:
+        """Last cell of the path."""
+        return self.path[-1][:2]
+
+    @property
     def robots(self) -> tuple[str, ...]:
         """Names of the robots of T2 that take part, in the order of `trust`."""
         return self.workspace.team.names
@@ -311,7 +321,7 @@ def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
 
     Without the key `robots`, all robots of the workspace take part.
     """
-    values = {name: _as_tuples(value) for name, value in record.items()}
+    values = {name: as_tuples(value) for name, value in record.items()}
     workspace = workspace.of_robots(values.pop("robots", workspace.team.names))
     values |= {name: np.array(record[name]) for name in ("trust", "bands")}
     values["risk"] = record["risk"] and PathRisk.from_record(record["risk"])
@@ -321,6 +331,6 @@ def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
     return Plan(**values, workspace=workspace)
 
 
-def _as_tuples(value: Any) -> Any:
+def as_tuples(value: Any) -> Any:
     """Convert lists, also within lists, to tuples."""
-    return tuple(map(_as_tuples, value)) if isinstance(value, list | tuple) else value
+    return tuple(map(as_tuples, value)) if isinstance(value, list | tuple) else value

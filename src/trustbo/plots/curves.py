@@ -29,6 +29,7 @@ from trustbo.plots.style import (
 
 _LABELS = {
     "contact_lost": "contact lost\n(bounds)",
+    "lost_share": "contact lost\n(% of bounds)",
     "objective": "objective\n(predicted)",
     "regret": "regret (%)",
 }
@@ -52,7 +53,7 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
 
     Args:
         given: Posterior from `tb.fit`, whose measured contact rates are plotted as dots; or a plan
-            computed from a posterior, such as `Result.plan`.
+            computed from a posterior, such as `Result.plan()`.
         mission: Index of the mission in a posterior; negative indices count from the last.
         ax: Axes to draw on, one for each robot; by default a new figure.
 
@@ -64,7 +65,7 @@ def trust_curves(given: xr.DataTree | Plan, mission: int = -1, *, ax: Any = None
 
     Example:
         >>> tb.plots.trust_curves(result.posterior)  # trust in the last mission
-        >>> tb.plots.trust_curves(result.plan)  # trust predicted along the recommended path
+        >>> tb.plots.trust_curves(result.plan())  # trust predicted along the recommended path
     """
     if isinstance(given, Plan):
         x = np.arange(1, len(given.trust) + 1)
@@ -129,23 +130,34 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
 
     A filled dot marks a plan that differs from the previous plan. A cross marks a mission that did
     not reach the goal. With the objective `lost_contact`, the measured and the predicted contact
-    lost share one axis, in bounds; predictions include the costs of failures.
+    lost share one axis, in bounds; predictions include the costs of failures. If the missions have
+    several courses, whose lengths may differ, the contact lost is also shown as a share of the
+    bounds of each mission.
 
     Args:
         history: History of a campaign, `Result.history`; see `Result.plot_history` for regret.
         ax: Axes to draw on, one for each variable; by default a new figure.
 
     Returns:
-        Axes, shape (variable,): contact lost, the objective unless it shares the first axes, and
-        regret.
+        Axes, shape (variable,): contact lost, its share of the bounds if there are several courses,
+        the objective unless it shares the axes of contact lost, and regret.
     """
     predicts_lost = history.attrs.get("objective") == _LOST
     names = [name for name in _LABELS if name in history]
     if predicts_lost:
         names.remove("objective")
+    if "lost_share" in names and not _has_several_courses(history):
+        names.remove("lost_share")
+
+    n_planned = (history["path"].isel(axis=0) >= 0).sum("step").values - 1
+    factors = {"lost_share": 100.0}
+    predicted = {
+        "contact_lost": -history["objective"].values,
+        "lost_share": -history["objective"].values / n_planned,
+    }
 
     mission = history["iteration"].values
-    changed = history["path_changed"].values.astype(bool) | (mission == 1)
+    changed = history["path_changed"].values.astype(bool) | (mission == mission[0])
     failed = history["status"].values.astype(str) != "ok"
     prefix = "measured, " if predicts_lost else ""
     dots = (changed, accent(), f"{prefix}new path"), (~changed, background(), f"{prefix}same path")
@@ -153,11 +165,12 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
     height = 2.6 if len(names) == 1 else 1.8  # in inches
     axes = panels(len(names), ax, (4.0, height), columns=1, sharex=True)
     for panel, name in zip(axes, names, strict=True):
-        values = history[name].values
+        factor = factors.get(name, 1.0)
+        values = factor * history[name].values
         panel.plot(mission, values, color=accent(), linewidth=1.6)
-        if name == "contact_lost" and predicts_lost:
+        if name in predicted and predicts_lost:
             style = {"color": ink(), "markersize": 14.0, "label": "predicted by the plan"}
-            panel.plot(mission, -history["objective"].values, "_", markeredgewidth=1.6, **style)
+            panel.plot(mission, factor * predicted[name], "_", markeredgewidth=1.6, **style)
         for which, fill, label in dots:
             style = {"color": accent(), "markerfacecolor": fill, "label": label}
             panel.plot(mission[which], values[which], "o", markersize=6.5, **style)
@@ -167,13 +180,18 @@ def campaign_history(history: xr.Dataset, *, ax: Any = None) -> np.ndarray:
 
         panel.set_ylabel(_LABELS[name])
         panel.margins(y=_MARGIN)
-        if name == "contact_lost":
+        if name in predicted:
             panel.set_ylim(bottom=min(0.0, *panel.get_ylim()))
 
     axes[-1].set_xlabel("mission")
     axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))
     add_legend(axes, handles_of(axes[0]))
     return axes
+
+
+def _has_several_courses(history: xr.Dataset) -> bool:
+    """Return whether the missions of a history differ in their start or goal."""
+    return len(set(zip(history["start"].values, history["goal"].values, strict=True))) > 1
 
 
 @styled

@@ -78,7 +78,7 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
     """Make an interactive map with layers, cell values at the pointer, and a slider over missions.
 
     Args:
-        plan: Recommended plan, such as `Result.plan`.
+        plan: Recommended plan, such as `Result.plan()`.
         maps: Maps of the cells, dims (y, x) or (row, col), such as `Result.maps()`.
         history: Paths, trust maps and outcomes of the missions, such as `Result.history`.
 
@@ -86,17 +86,17 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
         Page, which notebooks display and `save` writes to a file.
 
     Example:
-        >>> page = tb.plots.explore(result.plan, result.maps(), result.history)
+        >>> page = tb.plots.explore(result.plan(), result.maps(), result.history)
         >>> page.save("explore.html")
     """
-    require_kind("plan", plan, Plan, "give a Plan, such as Result.plan")
+    require_kind("plan", plan, Plan, "give a Plan, such as Result.plan()")
     require_kind("maps", maps, xr.Dataset, "give maps, such as Result.maps()")
     require_kind("history", history, xr.Dataset, "give Result.history")
     from bokeh.embed import file_html  # imported here, because it takes half a second
     from bokeh.resources import INLINE
 
     n = history.sizes["iteration"]
-    start, goal = (path_text([plan.path[k][:2]]) for k in (0, -1))
+    start, goal = (path_text([cell]) for cell in (plan.start, plan.goal))
     title = f"Path from {start} to {goal} after {n} {'mission' if n == 1 else 'missions'}"
     html = file_html(_layout(plan, maps, history), INLINE, title=title)
     viewport = '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -208,10 +208,11 @@ def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.n
         for name, values in maps.data_vars.items()
         if values.ndim == 2
     }
-    for i, trust in history["trust_map"].groupby("iteration"):
-        values = shown_values(trust.squeeze("iteration"), workspace)
-        values[plan.path[0][:2]] = np.nan  # assumed
-        layers[f"mission {i}"] = values
+    for i in range(history.sizes["iteration"]):
+        mission = history.isel(iteration=i)
+        values = shown_values(mission["trust_map"], workspace)
+        values[path_in(mission)[0][:2]] = np.nan  # assumed
+        layers[f"mission {int(mission['iteration'])}"] = values
     return layers
 
 
@@ -288,13 +289,17 @@ def _places(path: Sequence[Station], grid: Grid) -> dict[str, Any]:
 
 def _text(mission: xr.Dataset, objective: str) -> str:
     """Describe a mission in one line of HTML."""
-    value = float(mission["objective"])
-    predicted = f"predicted objective {value:z.3f}"
+    value = mission["objective"]
+    predicted = f"predicted objective {_measured(value, '.3f')}"
     if objective == "lost_contact":
         lost = _measured(mission["contact_lost"], ".2f")
-        predicted = f"contact lost {lost}, predicted {-value:z.2f} bounds"
+        predicted = f"contact lost {lost} bounds"
+        if np.isfinite(value):
+            predicted = f"contact lost {lost}, predicted {-float(value):z.2f} bounds"
+    start, goal = (mission[name].item() for name in ("start", "goal"))
     return (
-        f"<b>Mission {int(mission['iteration'])}</b>: {escape(str(mission['status'].item()))}, "
+        f"<b>Mission {int(mission['iteration'])}</b>, {start} to {goal} with "
+        f"{escape(str(mission['robots'].item()))}: {escape(str(mission['status'].item()))}, "
         f"contact rate {_measured(mission['contact_rate'], '.3f')}, "
         f"plan of {len(path_in(mission)) - 1} bounds, "
         f"{predicted}"

@@ -131,7 +131,9 @@ def trust_maps(
     require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
 
     recommended = _require_path(path, workspace)
-    n_missions = history.sizes["iteration"]
+    numbers = history["iteration"].values
+    n_missions = max(0, int(numbers.max()))  # earlier missions have negative numbers
+    n_earlier = int((numbers < 0).sum())
     if missions is None:
         chosen = [i for i in MOMENTS if i <= n_missions]
     else:
@@ -145,8 +147,10 @@ def trust_maps(
     paths = [*(path_in(planned.isel(iteration=i)) for i in range(len(chosen))), recommended]
     learned = [*(i - 1 for i in chosen), n_missions]
 
-    maps[:, *path[0][:2]] = np.nan
-    norm = Normalize(*limits_of(maps[np.array(learned) > 0], is_trust=True))
+    for values, cells in zip(maps, paths, strict=True):
+        values[cells[0][:2]] = np.nan  # trust at the start is assumed
+    has_learned = np.array(learned) + n_earlier > 0
+    norm = Normalize(*limits_of(maps[has_learned], is_trust=True))
 
     axes = map_panels(workspace.grid, len(maps), ax)
     for panel, values, cells, n in zip(axes, maps, paths, learned, strict=True):
@@ -157,6 +161,8 @@ def trust_maps(
 
         # In two lines if the panel is narrow.
         words = ("before", "mission 1") if n == 0 else ("after", f"mission {n}")
+        if n_missions == 0:
+            words = ("after", "earlier missions")
         panel.set_title((" " if is_broad(panel) else "\n").join(words))
 
     _trust_bar(axes, ScalarMappable(norm), maps, "expected trust", explain=True)

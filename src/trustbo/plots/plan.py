@@ -48,7 +48,7 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     their sight lines to the lead's next stop, and the routes to their next posts.
 
     Args:
-        plan: Plan on a terrain, such as `Result.plan`.
+        plan: Plan on a terrain, such as `Result.plan()`.
         bounds: Numbers of the bounds to plot, from 1; by default all. `[]` plots only the path.
         ax: Axes to draw on, one for the path and one for each bound; by default a new figure.
 
@@ -59,9 +59,9 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
         TrustboError: The workspace has no terrain, or there is no such bound.
 
     Example:
-        >>> tb.plots.plan_map(result.plan, bounds=[1, 2])
+        >>> tb.plots.plan_map(result.plan(), bounds=[1, 2])
     """
-    require_kind("plan", plan, Plan, "give a Plan, such as Result.plan")
+    require_kind("plan", plan, Plan, "give a Plan, such as Result.plan()")
     if plan.stops is None:
         raise TrustboError("plan_map needs a workspace made with Workspace.from_terrain.")
     n_bounds = len(plan.path) - 1

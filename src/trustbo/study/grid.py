@@ -30,7 +30,9 @@ _N_SHOWN = 3
 
 
 class Scene(NamedTuple):
-    """World of a simulated campaign: the assumed workspace, the simulator, start and goal.
+    """World of a simulated campaign: the assumed workspace, the simulator, and its courses.
+
+    A campaign has one course, from `start` to `goal`, or those of `courses` in turn.
 
     Example:
         >>> def make_scene():
@@ -41,8 +43,8 @@ class Scene(NamedTuple):
 
     workspace: Workspace
     simulator: Simulator
-    start: Cell
-    goal: Cell
+    start: Cell | None = None
+    goal: Cell | None = None
     truth: Truth | None = None
     """Truth of the simulator, used to compute the regret and loss of paths."""
     options: Mapping[str, Any] = {}
@@ -51,6 +53,16 @@ class Scene(NamedTuple):
     """Additional columns of the table that `run_grid` returns, and their values."""
     judged: Mapping[str, Any] = {}
     """Options of `Truth.best` for the best path, such as `max_bounds`."""
+    courses: Sequence[tuple[Cell, Cell]] = ()
+    """Start and goal of each mission, instead of `start` and `goal`; see `iterate`."""
+
+    def ends(self, mission: int) -> tuple[Cell, Cell]:
+        """Return start and goal of a mission, an index from 0."""
+        if self.courses:
+            return self.courses[mission % len(self.courses)]
+        if self.start is None or self.goal is None:
+            raise TrustboError("a scene needs start and goal, or courses=[(start, goal), ...].")
+        return self.start, self.goal
 
 
 type Case = Mapping[str, Any] | Callable[[Scene], Mapping[str, Any]]
@@ -217,18 +229,20 @@ def _rows(
     options: Mapping[str, Any], scene: Scene, seed: int, n_missions: int
 ) -> Iterator[dict[str, Any]]:
     """Run a campaign and yield its rows; the first is from before the first mission."""
-    ends = (scene.workspace, scene.start, scene.goal)
+    ends = (None, None) if scene.courses else scene.ends(0)
     options = {**scene.options, **copy.deepcopy(dict(options))}  # runs must not share a policy
 
-    with Campaign(*ends, seed=seed, directory=None, overwrite=False, **options) as campaign:
+    ground = (scene.workspace, *ends)
+    with Campaign(*ground, seed=seed, directory=None, overwrite=False, **options) as campaign:
         policy: Any = campaign.policy
-        yield {"mission": 0, **_recommended(_path_of(campaign), scene, 0)}
+        yield {"mission": 0, **_recommended(_path_of(campaign, scene, 0), scene, 0)}
 
         began = time.process_time()
-        for number, (_, mission) in enumerate(campaign.run(scene.simulator, n_missions), start=1):
+        steps = campaign.run(scene.simulator, n_missions, courses=scene.courses or None)
+        for number, (_, mission) in enumerate(steps, start=1):
             if hasattr(policy, "learn"):
                 policy.learn(campaign, mission)
-            path = _path_of(campaign)
+            path = _path_of(campaign, scene, number)
             seconds = time.process_time() - began
 
             contact_rate = campaign.state.entries[-1].measures["contact_rate"]
@@ -243,10 +257,14 @@ def _rows(
             began = time.process_time()
 
 
-def _path_of(campaign: Campaign) -> Sequence[Cell]:
-    """Return the path that a campaign, or its policy, recommends."""
+def _path_of(campaign: Campaign, scene: Scene, mission: int) -> Sequence[Cell]:
+    """Return the path that a campaign, or its policy, recommends for a mission, from 0."""
     choose = getattr(campaign.policy, "recommend", None)
-    return campaign.recommend().path if choose is None else choose(campaign)
+    if choose is None:
+        return campaign.recommend(*scene.ends(mission)).path
+    if scene.courses:
+        raise TrustboError("a policy with a method recommend needs a scene with one course.")
+    return choose(campaign)
 
 
 def _recommended(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, float]:
@@ -255,7 +273,7 @@ def _recommended(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, 
         return {}
 
     truth = scene.truth.at(mission)
-    best = truth.best(scene.start, scene.goal, **scene.judged)
+    best = truth.best(*scene.ends(mission), **scene.judged)
     regret = truth.regret(path, **scene.judged)
     return {"regret": regret, "lost": truth.lost(path), "best": truth.lost(best)}
 
@@ -266,7 +284,7 @@ def _driven(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, float
         return {}
 
     truth = scene.truth.at(mission)
-    ends = (scene.start, scene.goal)
+    ends = scene.ends(mission)
     best = truth.best(*ends, **scene.judged)
     safest = truth.best(*ends, **scene.judged, failures=True)
     return {
