@@ -9,6 +9,7 @@ from trustbo.planning.policies import POLICIES
 from trustbo.planning.problem import InfeasibleError
 from trustbo.planning.recursion import expected_trust
 from trustbo.planning.threats import threat_map
+from trustbo.planning.watchers import at_least, contact_dependence
 
 __all__ = [
     "OBJECTIVES",
@@ -17,6 +18,8 @@ __all__ = [
     "NoPathError",
     "Plan",
     "Planner",
+    "at_least",
+    "contact_dependence",
     "expected_trust",
     "policies",
     "threat_map",

@@ -1,6 +1,6 @@
 """The planner, which searches for paths from a start to a goal in a workspace."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any, Self
@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled
-from trustbo.data import POST_SETS, Cell, Station, require_path
+from trustbo.data import POST_SETS, Cell, Mission, Station, require_path
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
     TrustboError,
@@ -39,6 +39,7 @@ from trustbo.planning.problem import EXACT, Problem, draws_of, mean_and_draws_of
 from trustbo.planning.recursion import Recursion
 from trustbo.planning.robot_trust import robot_maps, robot_trust
 from trustbo.planning.trust_map import cost_of, trust_map
+from trustbo.planning.watchers import contact_dependence, watchers_along
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVE_NAMES, bounds_along, require_on_grid
@@ -384,6 +385,53 @@ class Planner(Summary):
 
         columns = ["bound", "posts", "chosen", "trust", "value"]
         return pd.DataFrame(rows, columns=columns).set_index(["bound", "posts"])
+
+    @computing()
+    def watchers(
+        self,
+        path: Sequence[Station],
+        params: Draws | xr.DataTree,
+        *,
+        missions: Iterable[Mission] = (),
+        seed: int = 0,
+    ) -> pd.DataFrame:
+        """Predict the contact of each robot along a path, and how often several have contact.
+
+        To learn what is lost without a robot, compare the tables of `Workspace.of_robots` with and
+        without it.
+
+        Robots do not lose contact independently, because a ridge may hide the lead from all of
+        them. The drawn rates of a bound have the effects of the place and the noise that robots
+        share. Given the rates, contact at a tick is a mixture of robots that lose the lead at the
+        same time and of independent robots; see `planning.at_least`.
+
+        Args:
+            path: Cells from start to goal, such as `Plan.path`.
+            params: Posterior from `fit`, or parameters. The effects of robots are drawn for the
+                next mission, as in `evaluate`.
+            missions: Missions whose contact at ticks is used to estimate how dependent contact is
+                (see `planning.contact_dependence`), such as `campaign.missions`.
+            seed: Seed of the drawn rates.
+
+        Returns:
+            Table with one row for each bound of the path, from 1, and the columns `rate_r1`, ...,
+            the expected contact rate of each robot that takes part, and `at_least_one` and
+            `at_least_two`, the expected shares of the bound's time in which so many robots have
+            contact. Means over the rows are those of the path.
+
+        Raises:
+            TrustboError: The path is not admissible, or the parameters do not fit the workspace.
+
+        Example:
+            >>> two = planner.workspace.of_robots(["r1", "r2"])
+            >>> of_two = tb.Planner(two, planner.start, planner.goal)
+            >>> of_two.watchers(plan.path, posterior, missions=[mission]).mean()
+        """
+        self.problem.require_family(params, uses_rates=True)
+        path = self.require_path(path)
+        seed = require_whole("seed", seed, 0)
+        draws = draws_of(params, self.workspace).drawn
+        return watchers_along(self.problem, path, draws, contact_dependence(missions), seed)
 
     @computing()
     def graph(self, params: Draws | xr.DataTree) -> nx.DiGraph | nx.MultiDiGraph:
