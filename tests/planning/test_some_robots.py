@@ -27,6 +27,7 @@ from trustbo.models import (
 from trustbo.planning import Planner
 from trustbo.planning.plan import plan_from_record, plan_to_record
 from trustbo.workspace.identity import map_name
+from trustbo.workspace.netcdf import workspace_from_tree, workspace_to_tree
 
 ENDS = (4, 0), (0, 4)
 GOING = ["r1", "r3"]
@@ -283,3 +284,14 @@ def test_a_record_of_a_plan_knows_who_goes(ground):
 
     del record["robots"]
     assert plan_from_record(record, ground).workspace is ground
+
+
+def test_a_stored_workspace_knows_who_goes(ground):
+    some = ground.of_robots(["r1", "r3"])
+    restored = workspace_from_tree(workspace_to_tree(some))
+    assert restored.team == some.team
+    assert restored.whole.team == ground.team
+    np.testing.assert_array_equal(restored.awareness, some.awareness)
+    np.testing.assert_array_equal(
+        restored.posts.watching((1, 1), None), some.posts.watching((1, 1), None)
+    )

@@ -121,6 +121,8 @@ class Plan(Summary):
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]
 
+        if self.workspace.within is not None:
+            rows.insert(1, ("robots", f"{', '.join(self.robots)}; the others stay at home"))
         if self.p_arrive is not None:
             beyond = "; the failure probability exceeds max_failure" if self.infeasible else ""
             rows.append(("arrival probability", f"{self.p_arrive:.3g}{beyond}"))

@@ -21,8 +21,11 @@ from trustbo.workspace.workspace import Workspace
 def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
     """Convert a workspace to a data tree.
 
-    Attributes of the terrain that netCDF cannot store become JSON.
+    Attributes of the terrain that netCDF cannot store become JSON. If robots stay at home, the tree
+    has the workspace of the whole team and the names of the others.
     """
+    robots = workspace.team.names
+    workspace = workspace.whole
     cells = xr.Dataset({"awareness": workspace.awareness, "passable": workspace.passable})
     if workspace.onward is not None:
         cells["onward"] = workspace.onward
@@ -44,6 +47,8 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
         "team": to_json(asdict(workspace.team)),
         "sight": to_json(workspace.sight and asdict(workspace.sight)),
     }
+    if robots != workspace.team.names:
+        result.attrs["robots"] = to_json(robots)
     return result
 
 
@@ -82,7 +87,9 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
 
     maps = cells["awareness"], cells["passable"]
     onward = cells.get("onward")
-    return Workspace(*maps, grid, team, terrain, pixels, composites, posts, onward)
+    workspace = Workspace(*maps, grid, team, terrain, pixels, composites, posts, onward)
+    robots = tree.attrs.get("robots")
+    return workspace if robots is None else workspace.of_robots(json.loads(robots))
 
 
 def difficulty_to_tree(difficulty: Difficulty) -> xr.DataTree:
