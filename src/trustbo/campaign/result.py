@@ -476,6 +476,38 @@ class Result(Summary):
         """
         return self.planner.compare_posts(self.path, self.belief)
 
+    def watchers(
+        self,
+        start: Location | None = None,
+        goal: Location | None = None,
+        *,
+        robots: Sequence[str] | None = None,
+    ) -> pd.DataFrame:
+        """Predict which robots see the lead along `plan()`, and for how long at least one or two.
+
+        To see what is lost without a robot, compare the tables of teams with and without it. The
+        mean contact of the team, which the value of a plan measures, may rise when a robot with
+        little contact stays at home. How strongly robots lose contact at the same time is estimated
+        from the contact at each tick that missions recorded; see `planning.contact_dependence`.
+
+        Args:
+            start: First cell, as in `plan`.
+            goal: Last cell, as in `plan`.
+            robots: Names of the robots that take part; by default the whole team.
+
+        Returns:
+            Table of `planning.Planner.watchers`, one row for each bound of the path.
+
+        Example:
+            >>> whole = result.watchers()
+            >>> part = result.watchers(robots=("r1", "r3"))
+            >>> float(whole["at_least_two"].mean() - part["at_least_two"].mean())
+        """
+        course = self._shown(start, goal, robots)
+        path = self._of_course("plan", course, lambda: self._with_bands(course)).path
+        measured = [entry.measured for entry in self.state.entries if entry.exclusion is None]
+        return self.planner_of(course).watchers(path, self.forecast, missions=measured)
+
     def robot_maps(self, *, expected: bool = False) -> xr.Dataset:
         """Compute maps of the trust in each robot in the next mission.
 

@@ -20,6 +20,7 @@ from trustbo.errors import (
     require_choice,
     require_positive,
     require_whole,
+    warn,
 )
 from trustbo.hazard.components import Components
 from trustbo.hazard.given import GivenRisk, read_risk
@@ -90,7 +91,9 @@ class Planner(Summary):
             max_failure: Largest failure probability of a path, in [0, 1); by default, no limit.
             failure_cost: Cost of a failure in bounds, for lost_contact. The value is reduced by
                 this cost times the failure probability. The default is the smallest number of
-                bounds of a path, so a failed mission counts as a mission without contact.
+                bounds of a path, so a failed mission counts as a mission without contact. If this
+                or `max_failure` is given, and `with_risk` is not called, plans have the failure
+                probabilities of the posterior of a campaign (its group `hazard`).
             family: Name of the trust model's observation family, used only for contact rates, as
                 in lost_contact. A posterior with trust on another scale is refused.
 
@@ -249,6 +252,26 @@ class Planner(Summary):
             components = components._replace(p_fail=groups)
         return self._with(risk=GivenRisk(mean, drawn, components))
 
+    def _informed_by(self, params: Draws | xr.DataTree) -> Self:
+        """Return a planner with the risk of a posterior, if failures count and no risk was given.
+
+        Warns if failures count, but neither the planner nor the posterior has a risk.
+        """
+        problem = self.problem
+        counts = bool(problem.failure_cost) or problem.max_failure is not None
+        if problem.risk is not None or not counts:
+            return self
+
+        if isinstance(params, xr.DataTree) and "hazard" in params.children:
+            return self.with_risk(BoundRisk(params["hazard"].to_dataset(), self.workspace))
+        if problem.max_failure is None:  # otherwise, the search raises an error
+            warn(
+                f"failure_cost = {problem.failure_cost:g} has no effect, because neither the "
+                "planner nor the posterior has failure probabilities; give the posterior of a "
+                "campaign, or use planner.with_risk(...)."
+            )
+        return self
+
     def with_failure_cost(self, failure_cost: float) -> Self:
         """Return a planner with another failure cost, in bounds.
 
@@ -285,15 +308,16 @@ class Planner(Summary):
                 workspace, or if beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
-        self.problem.require_family(params)
+        problem = self._informed_by(params).problem
+        problem.require_family(params)
         with stopwatch() as elapsed:
             mean, draws = mean_and_draws_of(params, self.workspace)
-            score, limits, paths = self.problem.best(self.problem.searched(mean, x0))
-            plan = evaluated(self.problem, self.problem.paths.cells(paths[0]), mean, draws, x0)
+            score, limits, paths = problem.best(problem.searched(mean, x0))
+            plan = evaluated(problem, problem.paths.cells(paths[0]), mean, draws, x0)
             seconds = elapsed()
 
         exact = bool(limits[0] - score[0] <= EXACT)
-        limit = plan.value if exact else float(self.problem.objective.value(limits[0]))
+        limit = plan.value if exact else float(problem.objective.value(limits[0]))
         return replace(plan, exact=exact, limit=limit, seconds=seconds)
 
     def best_path(self, recursion: Recursion) -> tuple[Station, ...]:
@@ -324,9 +348,10 @@ class Planner(Summary):
             TrustboError: If any draw has beta0 outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
-        self.problem.require_family(posterior)
+        problem = self._informed_by(posterior).problem
+        problem.require_family(posterior)
         ahead = draws_of(posterior, self.workspace)
-        return drawn_paths(self.problem, choose_draws(ahead.expected, n_draws, seed))
+        return drawn_paths(problem, choose_draws(ahead.expected, n_draws, seed))
 
     @computing()
     def evaluate(
@@ -346,10 +371,11 @@ class Planner(Summary):
             TrustboError: If the robots or features of the parameters differ from those of the
                 workspace, or if the path has gaps or does not lead from start to goal.
         """
-        self.problem.require_family(params)
+        problem = self._informed_by(params).problem
+        problem.require_family(params)
         path = self.require_path(path)
         draws = draws_of(params, self.workspace).drawn
-        return evaluated(self.problem, path, draws, None, x0)
+        return evaluated(problem, path, draws, None, x0)
 
     @computing()
     def compare_posts(self, path: Sequence[Station], params: Draws | xr.DataTree) -> pd.DataFrame:
@@ -372,7 +398,8 @@ class Planner(Summary):
             >>> planner.compare_posts(plan.path, posterior).loc[1]
         """
         path = self.require_path(path)
-        self.problem.require_family(params)
+        problem = self._informed_by(params).problem
+        problem.require_family(params)
         mean = mean_of(params, self.workspace)
 
         rows = []
@@ -380,7 +407,7 @@ class Planner(Summary):
             cell = path[k - 1][:2]
             for name in self.workspace.post_sets:
                 other = require_path("path", [*path[: k - 1], (*cell, name), *path[k:]])
-                plan = evaluated(self.problem, other, mean, None, None)
+                plan = evaluated(problem, other, mean, None, None)
                 rows.append((k, name, other == path, plan.trust[k - 1].mean(), plan.value))
 
         columns = ["bound", "posts", "chosen", "trust", "value"]
@@ -476,8 +503,9 @@ class Planner(Summary):
         Raises:
             TrustboError: If abs(beta0) >= 1, because trust would then grow without limit.
         """
-        self.problem.require_family(params, uses_rates=True)
-        return graph_of(self.problem, mean_of(params, self.workspace))
+        problem = self._informed_by(params).problem
+        problem.require_family(params, uses_rates=True)
+        return graph_of(problem, mean_of(params, self.workspace))
 
     @computing()
     def trust(
@@ -621,7 +649,9 @@ class Planner(Summary):
             attribute `start` of the maps of trust and cost is the start, where trust is assumed.
         """
         ahead = draws_of(posterior, self.workspace)
-        return maps_of(self.problem, ahead, n_draws, seed, expected=expected)
+        return maps_of(
+            self._informed_by(posterior).problem, ahead, n_draws, seed, expected=expected
+        )
 
 
 def _bound_cost_of(bound_cost: ArrayLike, bounds: np.ndarray) -> np.ndarray:
