@@ -325,6 +325,7 @@ def run(given: Namespace) -> pd.DataFrame:
     sets, n_missions = given.set or SETS, given.missions
     if given.quick:
         some, sets, n_missions = some[:3], sets[:1], 2
+        given.out = Path(f"{given.out}-quick")  # its campaigns are shorter
 
     shared = given.method or tuple(METHODS), given.out, given.truths, sets, n_missions
     with parallel_config("loky", inner_max_num_threads=1):
