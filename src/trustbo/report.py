@@ -14,6 +14,7 @@ from arviz_stats.summary import summary
 
 from trustbo import plots
 from trustbo.campaign.result import Result
+from trustbo.campaign.state import EXCLUDED
 from trustbo.data import path_text
 from trustbo.display import render
 from trustbo.errors import require_kind
@@ -43,8 +44,8 @@ _OF_BOUNDS = {
     "begun": "driven",
 }
 """Headings of the table of bounds, keyed by the columns of `bounds_of`."""
-_OF_MISSIONS = ("start", "goal", "robots", "status", "failed_bounds", "plan", "contact_rate",
-                "contact_lost", "lost_share", "objective", "n_bounds", "n_unmeasured")  # fmt: skip
+_OF_MISSIONS = ("start", "goal", "robots", "status", "state", "failed_bounds", "plan",
+                "contact_rate", "contact_lost", "lost_share", "objective", "n_bounds", "n_unmeasured")  # fmt: skip
 """Columns of the table of missions, if they have values."""
 _DIAGNOSTICS = {
     "k_hat": "Pareto k-hat (at most 0.7, good below 0.5)",
@@ -138,15 +139,19 @@ def bounds_of(result: Result) -> pd.DataFrame:
     - `contact`: expected contact rate, mean of the robots.
     - `measured`: mean of the measured contact rates over missions and robots; NaN if there is none.
     - `begun`: number of times that missions on this map began the bound, from the same cell.
+
+    Missions that a user has excluded do not count.
     """
     plan = result.plan()
     problem = result.planner.problem
     noise_sd = problem.recursion(result.belief.mean()).noise_sd
     contact = np.minimum(problem.likelihood.mean_rate(plan.trust, noise_sd), 1.0)
 
-    earlier = [mission for mission in result.state.earlier.missions if not mission.map]
+    state = result.state
+    earlier = [mission for mission in state.earlier.missions if not mission.map]
+    own = [entry.mission for entry in state.entries if entry.exclusion is None]
     rates = defaultdict(list)  # by the cells left and entered
-    for mission in [*earlier, *result.missions]:
+    for mission in [*earlier, *own]:
         for (a, c), rate in zip(pairwise(mission.path), mission.contact_rate, strict=False):
             rates[a, c[:2]].append(pd.Series(rate).mean())  # of the measured robots
     of_path = [pd.Series(rates[a, c[:2]], dtype=float) for a, c in pairwise(plan.path)]
@@ -251,6 +256,8 @@ def _tables(result: Result, path_table: pd.DataFrame) -> dict[str, str]:
     missions: Any = result.table()
     missions["plan"] = np.where(missions["replanned"], "replanned", "")
     empty = [name for name in ("failed_bounds", "plan") if not missions[name].any()]
+    if not (missions["state"] == EXCLUDED).any():
+        empty.append("state")
     empty += [name for name in ("start", "goal", "robots") if missions[name].nunique() < 2]
     if "start" in empty and "goal" in empty:
         empty.append("lost_share")

@@ -653,7 +653,8 @@ class Result(Summary):
         """Whether each cell was entered before each mission and after the last, on this map."""
         before = [mission for mission in self.state.earlier.missions if not mission.map]
         driven = np.zeros((1 + len(self.missions), *self.workspace.grid.shape), dtype=bool)
-        for n, missions in enumerate([before, *([mission] for mission in self.missions)]):
+        own = [[] if entry.exclusion else [entry.mission] for entry in self.state.entries]
+        for n, missions in enumerate([before, *own]):
             for mission in missions:
                 cells = [bound.cell for bound in mission.bounds if bound.cell != NOWHERE]
                 for cell in cells:
