@@ -45,7 +45,8 @@ _OF_BOUNDS = {
 }
 """Headings of the table of bounds, keyed by the columns of `bounds_of`."""
 _OF_MISSIONS = ("start", "goal", "robots", "status", "state", "failed_bounds", "plan",
-                "contact_rate", "contact_lost", "lost_share", "objective", "n_bounds", "n_unmeasured")  # fmt: skip
+                "contact_rate", "contact_lost", "lost_share", "objective", "n_bounds",
+                "n_unmeasured")  # fmt: skip
 """Columns of the table of missions, if they have values."""
 _DIAGNOSTICS = {
     "k_hat": "Pareto k-hat (at most 0.7, good below 0.5)",
