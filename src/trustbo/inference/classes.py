@@ -15,7 +15,15 @@ from trustbo.display import slow_bar
 from trustbo.inference import ep
 from trustbo.inference.density import Coefficients, Density, JointDraws, at
 from trustbo.inference.engine import inputs
-from trustbo.inference.importance import MAX_KHAT, ROUNDS, Points, Student, climb_on, sample
+from trustbo.inference.importance import (
+    MAX_KHAT,
+    ROUNDS,
+    Points,
+    Student,
+    climb,
+    climb_on,
+    sample,
+)
 from trustbo.inference.latent import (
     N_PRIOR,
     N_TRAJECTORIES,
@@ -136,15 +144,15 @@ def by_importance(
 ) -> tuple[JointDraws, dict[str, np.ndarray], dict[str, Any]]:
     """Take n draws by importance sampling; return the draws, statistics (draw,) and a summary.
 
-    `first` is the first proposal. By default, or if its weights are uneven, the first proposal is
-    found by a search for the mode. If these weights are uneven as well, the search goes on from its
-    end, and there are more rounds, which are larger. Unless rates are Gaussian, EP is corrected at
-    each point instead of drawing larger rounds.
+    `first` is the first proposal. By default, or if its weights are uneven or it leads to another
+    mode, the first proposal is found by a search for the mode. If these weights are uneven as well,
+    the search goes on from its end, and there are more rounds, which are larger. Unless rates are
+    Gaussian, EP is corrected at each point instead of drawing larger rounds.
     """
     rng = np.random.default_rng(seed)
     last_size = _LAST_SIZE if density.is_gaussian else _SIZE
     attempts = [(_SIZE, None), (last_size, None)]
-    if first:
+    if first and _is_possible(density, first):
         attempts = [(_SIZE, first), *attempts]
     while True:
         size, proposal = attempts.pop(0)
@@ -152,11 +160,50 @@ def by_importance(
             size = 4 * size
 
         is_last = not attempts
-        drawn, log_p, summary = _draws(density, n, size, rng, proposal, is_last)
+        found = _draws(density, n, size, rng, proposal, is_last)
+        if found is None:
+            continue
+
+        drawn, log_p, summary = found
         if summary["k_hat"] <= MAX_KHAT or is_last:
             return drawn, {"lp": log_p}, summary
 
 
+def _is_possible(density: Density, first: Student) -> bool:
+    """Return whether a first proposal is finite and has a positive density at its center.
+
+    Unless rates are Gaussian, EP is run there; if the proposal is not possible, EP forgets it.
+    """
+    with np.errstate(all="ignore"):  # extreme scores overflow
+        if not all(np.isfinite(array**2).all() for array in first):
+            return False
+
+        center = first.center[None]
+        density.run_ep(density.theta(center))
+    if np.isfinite(density.log_density(center)[0]):
+        return True
+
+    density.reset_ep()
+    return False
+
+
+def _is_elsewhere(density: Density, points: Points) -> bool:
+    """Return whether points whose first proposal was far away do not represent the posterior.
+
+    They may be at a lower mode than the search for the mode finds. Unless rates are Gaussian, their
+    density is that of EP near the first proposal, which is not accurate elsewhere.
+    """
+    if not density.is_gaussian:
+        density.reset_ep()
+        return True
+    if points.k_hat > MAX_KHAT:
+        return False  # the search follows in any case
+
+    mode = climb(density.log_density, density.start())
+    return points.misses(density.log_density, mode)
+
+
+@np.errstate(all="ignore")  # scores of points that are far away overflow
 def _draws(
     density: Density,
     n: int,
@@ -164,8 +211,10 @@ def _draws(
     rng: np.random.Generator,
     first: Student | None,
     is_last: bool,
-) -> tuple[JointDraws, np.ndarray, dict[str, Any]]:
+) -> tuple[JointDraws, np.ndarray, dict[str, Any]] | None:
     """Take n draws, beginning with the proposal `first` or with a search for the mode.
+
+    Returns None if `first` was so far away that the points may not represent the posterior.
 
     Unless rates are Gaussian, the density of EP is corrected at the points in the end. In the last
     attempt, EP is run and corrected at each visited point instead, so that later proposals are
@@ -177,7 +226,6 @@ def _draws(
             start = climb_on(density.log_density, start)
     else:
         start = first.center
-        density.run_ep(density.theta(start[None]))
 
     at_once = is_last and not density.is_gaussian
     visited: list[Coefficients] = []
@@ -201,6 +249,9 @@ def _draws(
         size=size, most=_LAST_ROUNDS if is_last else ROUNDS,
         defensive=density.defensive, first=first, visit=visit,
     )  # fmt: skip
+    if first is not None and points.is_far and _is_elsewhere(density, points):
+        return None
+
     coefficients = Coefficients.joined(visited)
     proposal = points.proposal.text
 

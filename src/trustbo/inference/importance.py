@@ -79,6 +79,8 @@ _APART = 1.0
 """Distance in sds from which two modes count as distinct."""
 _NEGLIGIBLE = 8.0
 """Modes whose log density is this much below that of the highest mode are left out."""
+_MISSED = np.log(1000.0)
+"""Log ratio of the posterior to the points' proposal above which points miss a mode."""
 _SKEW_STEP = 2.0
 """Distance from the mode at which skewness is measured, in sds."""
 _SKEWS = (0.3, 3.0)
@@ -210,6 +212,8 @@ class Points(NamedTuple):
         k_hat: Pareto shape of the weights, which is good below 0.5 and bad above 0.7.
         log_evidence: Log of the integral of the density.
         near: Proposal to which `proposal` is close if few points are effective.
+        is_far: Whether too few points of the first round were effective to estimate moments. A
+            first proposal that is given is then far from the posterior.
     """
 
     z: np.ndarray
@@ -219,6 +223,7 @@ class Points(NamedTuple):
     k_hat: float
     log_evidence: float
     near: Student
+    is_far: bool = False
 
     @classmethod
     def from_log_weights(
@@ -233,16 +238,30 @@ class Points(NamedTuple):
         return 1.0 / float((self.weight**2).sum())
 
     @property
+    def _n_for_moments(self) -> float:
+        """Effective number of points that is needed to estimate moments."""
+        return _PER_AXIS * self.z.shape[1]
+
+    @property
     def proposal(self) -> Student:
         """Fit a Student-t to the points; if few points dominate, flatten their weights."""
         weight = self.weight
-        least = _PER_AXIS * self.z.shape[1]
         for _ in range(_FLATTENED):
-            if (weight**2).sum() * least <= 1.0:
+            if (weight**2).sum() * self._n_for_moments <= 1.0:
                 break
             weight = np.sqrt(weight) / np.sqrt(weight).sum()
 
         return Student.from_points(self.z, weight, self.near)
+
+    @property
+    def is_enough_for_moments(self) -> bool:
+        """Whether enough points are effective to estimate moments."""
+        return self.kish >= self._n_for_moments
+
+    def misses(self, log_density: LogDensity, mode: np.ndarray) -> bool:
+        """Return whether the density at a mode (score,) is far above that of the points."""
+        log_p = log_density(mode[None]) - self.log_evidence
+        return bool(log_p[0] - self.proposal.log_density(mode[None])[0] > _MISSED)
 
     def resample(self, n: int, rng: np.random.Generator) -> np.ndarray:
         """Draw indices of `n` equally weighted points; see `resampled`."""
@@ -299,6 +318,7 @@ def sample(
     log_p = np.empty(0)
     mixture = []
     uneven = False
+    is_far = False
     n_rounds = 0
     while True:
         # Step 2: draw points, and weight all points so far by the mixture of all proposals so far.
@@ -314,10 +334,11 @@ def sample(
         log_q = special.logsumexp(log_q, axis=0) - np.log(len(z))
         log_ratio = np.where(np.isfinite(log_p), log_p, -np.inf) - log_q
         points = Points.from_log_weights(z, log_p, log_ratio, modes[0])
+        is_far = is_far or (n_rounds == 1 and not points.is_enough_for_moments)
 
         good = points.k_hat < GOOD_KHAT
         if (good and points.kish > enough and n_rounds > 1) or n_rounds == most:
-            return points
+            return points._replace(is_far=is_far)
 
         # Step 3: fit the proposal of the next round, whose size depends on how many points are
         # missing.
