@@ -1,0 +1,315 @@
+"""Campaigns of many courses, with robots that stay at home: any order of operations is safe."""
+
+import contextlib
+import json
+import tempfile
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from worlds import ModelSimulator, random_cells
+
+import trustbo as tb
+from trustbo.files import to_json
+from trustbo.hazard.trials import CAUSES
+from trustbo.models import PooledTrust
+from trustbo.planning.plan import plan_to_record
+
+TEAM = "r1", "r2", "r3"
+SOME = "r1", "r3"
+ENDS = (3, 0), (0, 3)
+BACK = ENDS[::-1]
+ACROSS = (0, 0), (3, 3)
+COURSES = (ENDS, BACK, ACROSS, ((2, 1), (2, 3)), ((3, 0), (3, 1)))
+QUICK = {"model": PooledTrust(), "sampler": "importance", "fit": {"draws": 60}, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def workspace():
+    return random_cells()
+
+
+def begin(workspace, *ends, **options):
+    return tb.Campaign(workspace, *ends, **QUICK | options)
+
+
+def way(start, goal, via=None):
+    """Cells of the shortest way from start to goal, through another cell if one is given."""
+    path = [start]
+    for target in (goal,) if via is None else (via, goal):
+        while path[-1] != target:
+            steps = np.sign(np.subtract(target, path[-1]))
+            path.append(tuple(np.add(path[-1], steps).tolist()))
+    return tuple(path)
+
+
+def drive(workspace, path, seed=0, *, fail_at=None, robots=TEAM):
+    """Run a path with some robots."""
+    seed = int(seed.integers(2**31)) if isinstance(seed, np.random.Generator) else seed
+    simulator = ModelSimulator(workspace, blind=True, fail_at=fail_at)
+    return simulator.run(path, seed=seed).of_robots(robots)
+
+
+# --- any order of operations ---
+
+
+class Told(NamedTuple):
+    """What was told of a mission, and whether a user has excluded it."""
+
+    mission: tb.Mission
+    excluded: bool = False
+
+
+class Field:
+    """A campaign in a folder, and beside it a simple list of all that was reported to it."""
+
+    def __init__(self, folder):
+        self.folder = Path(folder)
+        self.workspace = random_cells()
+        self.told: list[Told] = []
+        self.failures: list[tuple[str, bool]] = []
+        self.campaign = begin(self.workspace, directory=folder)
+        self.n_done = self.n_refused = 0
+        self.before = self.seen()
+
+    def close(self):
+        self.campaign.close()
+
+    def run(self, name, seed):
+        """Run an operation; if it is refused, everything is as before."""
+        self.before = self.seen()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                getattr(self, name)(np.random.default_rng(seed))
+            self.n_done += 1
+        except tb.TrustboError:
+            self.n_refused += 1
+            assert self.seen() == self.before
+        self.check()
+
+    def seen(self):
+        """All that was recorded and asked for, as text."""
+        asked = self.campaign.state.asked
+        plan = None if asked is None else plan_to_record(asked)
+        return self.campaign.table().to_csv(), to_json(plan)
+
+    def check(self):
+        """Compare what is recorded with what was reported."""
+        campaign = self.campaign
+        assert len(campaign.missions) == len(self.told)
+        for entry, told in zip(campaign.state.entries, self.told, strict=True):
+            rates = entry.mission.of_robots(told.mission.robots).contact_rate
+            np.testing.assert_array_equal(rates, told.mission.contact_rate)
+            stayed = [name not in told.mission.robots for name in TEAM]
+            assert np.isnan(entry.mission.contact_rate[:, stayed]).all()
+            assert entry.mission.path == told.mission.path
+            assert (entry.exclusion is not None) == told.excluded
+            assert entry.course.start == told.mission.path[0]
+            if told.mission.status == "ok":
+                assert entry.course.goal == told.mission.path[-1]
+            assert entry.course.robots == told.mission.robots
+        found = [(one.reason, bool(one.withdrawn)) for one in campaign.state.failures]
+        assert found == self.failures
+
+        used = [j for j, told in enumerate(self.told) if not told.excluded]
+        assert list(campaign.state.used) == used
+        record = json.loads((self.folder / "campaign.json").read_text())
+        files = [name for name in record["files"] if name.startswith("missions/")]
+        assert len(files) == len(self.told)
+
+    def any_course(self, rng):
+        """Arguments of `ask` and `plan`, of which some are wrong."""
+        course: list = [*COURSES[rng.integers(len(COURSES))]]
+        kind = rng.integers(12)
+        if kind == 0:
+            course[1] = course[0]
+        elif kind == 1:
+            course[0] = (9, 9)
+        elif kind == 2:
+            course[rng.integers(2)] = None
+        robots = [None, None, TEAM, SOME, SOME[::-1], ("r2",), ("r1", "r9"), ()][rng.integers(8)]
+        return course, {"robots": robots}
+
+    def any_path(self, rng):
+        start, goal = COURSES[rng.integers(len(COURSES))]
+        via = tuple(rng.integers(4, size=2).tolist()) if rng.random() < 0.5 else None
+        return way(start, goal, via)
+
+    def ask(self, rng):
+        course, options = self.any_course(rng)
+        plan = self.campaign.ask(*course, **options)
+        assert self.campaign.ask() is plan
+        assert self.campaign.ask(*course, **options) is plan
+
+    def ask_again(self, rng):
+        self.campaign.ask()
+
+    def plan(self, rng):
+        before = self.seen(), (self.folder / "campaign.json").read_bytes()
+        course, options = self.any_course(rng)
+        with contextlib.suppress(tb.TrustboError):
+            self.campaign.plan(*course, **options)
+        assert before == (self.seen(), (self.folder / "campaign.json").read_bytes())
+
+    def suggest(self, rng):
+        robots = self.any_course(rng)[1]["robots"]
+        path = self.any_path(rng)
+        assert self.campaign.suggest(path, robots=robots).path == path
+
+    def told_now(self, mission, **options):
+        n = len(self.campaign.missions)
+        self.campaign.tell(mission, **options)
+        assert len(self.campaign.missions) == n + 1
+        assert self.campaign.state.asked is None
+        self.told.append(Told(mission))
+
+    def asked(self, rng):
+        """Path and robots of the next mission; sometimes, no path has been asked for."""
+        plan = self.campaign.state.asked
+        if plan is None and rng.random() < 0.7:
+            plan = self.campaign.ask(*COURSES[rng.integers(len(COURSES))])
+            self.before = self.seen()
+        if plan is None:
+            return self.any_path(rng), TEAM
+        return plan.path, plan.robots
+
+    def some_bounds(self, rng, path):
+        return int(rng.integers(1, len(path)))
+
+    def tell(self, rng):
+        path, robots = self.asked(rng)
+        self.told_now(drive(self.workspace, path, rng, robots=robots))
+
+    def tell_stuck(self, rng):
+        path, robots = self.asked(rng)
+        n = self.some_bounds(rng, path)
+        mission = drive(self.workspace, path, rng, fail_at=n, robots=robots)
+        if rng.random() < 0.5:  # the log ends there
+            mission = replace(mission, path=mission.path[: n + 1])
+        self.told_now(replace(mission, status=CAUSES[rng.integers(len(CAUSES))]))
+
+    def tell_aborted(self, rng):
+        path, robots = self.asked(rng)
+        n = self.some_bounds(rng, path)
+        mission = drive(self.workspace, path, rng, fail_at=n, robots=robots)
+        self.told_now(replace(mission, status="aborted"))
+
+    def tell_elsewhere(self, rng):
+        _, robots = self.asked(rng)
+        self.told_now(drive(self.workspace, self.any_path(rng), rng, robots=robots))
+
+    def tell_of_others(self, rng):
+        path, robots = self.asked(rng)
+        others = [("r2",), ("r2", "r3"), SOME][rng.integers(3)]
+        mission = drive(self.workspace, path, rng, robots=others)
+        if others != robots:
+            with pytest.raises(tb.TrustboError):
+                self.campaign.tell(mission)
+            raise tb.TrustboError("refused")
+        self.told_now(mission)
+
+    def tell_twice(self, rng):
+        if not self.told:
+            return
+        k = int(rng.integers(len(self.told)))
+        mission = self.told[k].mission
+        if rng.random() < 0.5:
+            self.told_now(mission, again=True)
+        else:
+            self.told_now(mission)
+            assert all(told.excluded for told in self.told[:-1] if told.mission is mission)
+
+    def fail(self, rng):
+        reason = ("rain", "stuck", "timeout", "got stuck")[rng.integers(4)]
+        plan = self.campaign.state.asked
+        where = None
+        if plan is not None and rng.random() < 0.5:
+            where = plan.path[rng.integers(len(plan.path))][:2]
+        self.campaign.fail(reason, where=where)
+        self.failures.append((reason, False))
+
+    def withdraw(self, rng):
+        n = int(rng.integers(1, len(self.failures) + 2))
+        self.campaign.withdraw(n, "a mistake")
+        reason, withdrawn = self.failures[n - 1]
+        assert not withdrawn
+        self.failures[n - 1] = reason, True
+
+    def exclude(self, rng):
+        n = int(rng.integers(1, len(self.told) + 2))
+        self.campaign.exclude(n, "a bad day")
+        assert not self.told[n - 1].excluded
+        self.told[n - 1] = self.told[n - 1]._replace(excluded=True)
+
+    def replan(self, rng):
+        plan = self.campaign.ask()
+        k = self.some_bounds(rng, plan.path)
+        if rng.random() < 0.4:
+            blocked = [plan.path[k : k + 2]] if k + 1 < len(plan.path) else []
+            new = self.campaign.replan(plan.path[k][:2], blocked=blocked)
+        else:
+            status = ("stuck", "aborted")[rng.integers(2)]
+            so_far = drive(self.workspace, plan.path, rng, fail_at=k, robots=plan.robots)
+            so_far = replace(so_far, path=so_far.path[: k + 1], status=status)
+            new = self.campaign.replan(plan.path[k - (status == "stuck")][:2], so_far)
+        assert new.robots == plan.robots
+        assert (new.start, new.goal) == (plan.start, plan.goal)
+
+    def reopen(self, rng):
+        before = self.seen(), posterior_bytes(self.campaign)
+        self.campaign.close()
+        with pytest.raises(tb.TrustboError):
+            self.campaign.tell(drive(self.workspace, way(*ENDS), rng))
+        self.campaign = tb.Campaign.load(self.folder, progress=False)
+        assert before == (self.seen(), posterior_bytes(self.campaign))
+        assert self.campaign.state.asked is self.campaign.state.asked
+
+
+OPERATIONS = (
+    "ask", "ask_again", "plan", "suggest", "tell", "tell_stuck", "tell_aborted", "tell_elsewhere",
+    "tell_of_others", "tell_twice", "fail", "withdraw", "exclude", "replan", "reopen",
+)  # fmt: skip
+
+
+def posterior_bytes(campaign):
+    """Bytes of all draws of the last posterior."""
+    tree = campaign.state.posterior
+    if tree is None:
+        return {}
+    return {
+        (group, name): values.values.tobytes()
+        for group in tree.children
+        for name, values in tree[group].data_vars.items()
+    }
+
+
+def run_operations(operations):
+    with tempfile.TemporaryDirectory() as folder:
+        field = Field(Path(folder) / "campaign")
+        try:
+            for name, seed in operations:
+                field.run(name, seed)
+        finally:
+            field.close()
+        return field.n_done, field.n_refused
+
+
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(st.lists(st.tuples(st.sampled_from(OPERATIONS), st.integers(0, 2**32 - 1)), max_size=12))
+def test_any_order_of_operations_loses_and_doubles_nothing(operations):
+    run_operations(operations)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(50))
+def test_two_thousand_operations_lose_and_double_nothing(seed):
+    rng = np.random.default_rng(seed)
+    names = rng.choice(OPERATIONS, 40).tolist()
+    n_done, _ = run_operations([(name, [seed, k]) for k, name in enumerate(names)])
+    assert n_done > 10
