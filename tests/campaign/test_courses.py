@@ -206,7 +206,7 @@ class Field:
 
     def tell_of_others(self, rng):
         path, robots = self.asked(rng)
-        others = [("r2",), ("r2", "r3"), SOME][rng.integers(3)]
+        others = [("r2",), ("r2", "r3"), SOME, TEAM][rng.integers(4)]
         mission = drive(self.workspace, path, rng, robots=others)
         if others != robots:
             with pytest.raises(tb.TrustboError):
@@ -313,3 +313,26 @@ def test_two_thousand_operations_lose_and_double_nothing(seed):
     names = rng.choice(OPERATIONS, 40).tolist()
     n_done, _ = run_operations([(name, [seed, k]) for k, name in enumerate(names)])
     assert n_done > 10
+
+
+def test_a_robot_that_was_planned_is_not_missing_and_one_at_home_has_no_rates(workspace):
+    campaign = begin(workspace, *ENDS)
+    path = campaign.ask().path
+    with pytest.raises(tb.TrustboError, match="r2"):
+        campaign.tell(drive(workspace, path, robots=SOME))
+
+    campaign.ask(robots=SOME)
+    with pytest.raises(tb.TrustboError, match="r3"):
+        campaign.tell(drive(workspace, path, robots=("r1",)))
+    whole = drive(workspace, path)
+    with pytest.raises(tb.TrustboError, match="r2"):
+        campaign.tell(whole)
+    assert campaign.missions == []
+
+    rates = whole.contact_rate.copy()
+    rates[:, 1] = np.nan
+    campaign.tell(replace(whole, contact_rate=rates))
+    assert campaign.state.entries[0].measured.robots == SOME
+    campaign.ask(robots=SOME)
+    with pytest.raises(tb.TrustboError, match="again"):
+        campaign.tell(whole.of_robots(SOME))

@@ -405,14 +405,26 @@ class Campaign(Recorder):
     def _in_order(self, mission: Mission, robots: Sequence[str] | None) -> Mission:
         """Return a mission with its robots and features in the order of the workspace.
 
+        Robots of the team that stayed at home are left out; they have no rates.
+
         Args:
             mission: Mission of the whole team, or of the robots that take part.
             robots: Robots that take part in the plan; None for the whole team.
 
         Raises:
-            TrustboError: The robots or features differ.
+            TrustboError: The robots or features differ, or a robot that stayed at home has rates.
         """
         team = self.workspace.team.names
+        if robots is not None and set(robots) < set(mission.robots) <= set(team):
+            stayed = [name for name in team if name in set(mission.robots) - set(robots)]
+            if np.isfinite(mission.of_robots(stayed).contact_rate).any():
+                raise TrustboError(
+                    f"the mission has rates of {joined(stayed)}, but {joined(robots)} were "
+                    f"planned; tell mission.of_robots({tuple(robots)}), or first call ask with "
+                    "the robots that went."
+                )
+            mission = mission.of_robots(robots)
+
         went = set(mission.robots)
         if robots is not None and went == set(robots):
             return self.workspace.of_robots(robots).in_order(mission)
