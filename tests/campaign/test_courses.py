@@ -541,3 +541,16 @@ def test_the_order_of_missions_of_many_courses_does_not_matter(workspace):
         means.append(posterior["posterior"])
     for name, values in means[0].data_vars.items():
         np.testing.assert_allclose(values, means[1][name], rtol=1e-8, atol=1e-12, err_msg=name)
+
+
+def test_a_robot_at_home_has_the_awareness_of_the_map_and_no_rates(workspace):
+    campaign = begin(workspace, *ENDS)
+    path = campaign.ask(robots=SOME).path
+    campaign.tell(drive(workspace, path, robots=SOME))
+    learned = campaign.missions[0]
+    assert learned.robots == workspace.team.names
+    np.testing.assert_array_equal(learned.awareness, workspace.along(path))
+    at_home = [name not in SOME for name in learned.robots]
+    np.testing.assert_array_equal(
+        np.isnan(learned.contact_rate), np.tile(at_home, (len(path) - 1, 1))
+    )

@@ -383,7 +383,8 @@ class Campaign(Recorder):
 
             learned = as_learned(mission, self.workspace, self.state.settings["awareness"])
             if mission.robots != self.workspace.team.names:
-                self.learner.require_poolable([learned], self.workspace.team.names)
+                team = self.workspace.team.names
+                self.learner.require_poolable([mission.with_robots(team)], team)
             plan = self._plan_told(mission)
             trust_map = self._trust_map_of(Course.of(plan))
 

@@ -32,7 +32,8 @@ AWARENESS = ("map", "measured")
 def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Mission:
     """Return a mission with the awareness from which a campaign learns.
 
-    The result has all robots of the workspace; those that stayed at home have no rates.
+    The result has all robots of the workspace. Those that stayed at home have no rates, and the
+    awareness of the map, since the noise of rates depends on the line of sight of the whole team.
 
     Args:
         mission: Mission with the awareness that was measured, NaN where it was not, by the robots
@@ -45,8 +46,7 @@ def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Missio
         TrustboError: The path leaves the grid or skips cells.
     """
     try:
-        seen = workspace.of_robots(mission.robots)
-        known = seen.along(mission.path, anywhere=True)[: len(mission.bounds)]
+        of_team = workspace.along(mission.path, anywhere=True)[: len(mission.bounds)]
     except TrustboError as error:
         if any(status != "ok" for status in mission.bound_status[:-1]):
             raise TrustboError(
@@ -55,10 +55,17 @@ def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Missio
             ) from None
         raise
 
+    team = workspace.team.names
+    known = of_team[:, [team.index(name) for name in mission.robots]]
     measured = mission.awareness
     first, second = (measured, known) if awareness == "measured" else (known, measured)
     learned = mission.with_awareness(np.where(np.isnan(first), second, first))
-    return learned.with_robots(workspace.team.names)
+    if mission.robots == team:
+        return learned
+
+    whole = learned.with_robots(team)
+    went = np.isin(team, mission.robots)[:, None]
+    return whole.with_awareness(np.where(went, whole.awareness, of_team))
 
 
 def require_new(state: State, mission: Mission) -> None:
