@@ -1,4 +1,4 @@
-"""Crash test: campaigns are killed at random moments; resuming must give identical results.
+"""Crash test: campaigns of three courses, killed at random, must resume with identical results.
 
 python benchmarks/kills.py [--kills 20]
 """
@@ -16,7 +16,7 @@ import numpy as np
 import trustbo as tb
 from trustbo.models import TrustParams
 
-ENDS = (3, 0), (0, 3)
+COURSES = [((3, 0), (0, 3)), ((0, 0), (3, 3)), ((0, 3), (3, 0))]
 N_MISSIONS = 8
 
 
@@ -33,7 +33,8 @@ def go_on(folder):
     options = {"simulator": robots, "n_iterations": N_MISSIONS, "progress": False}
     if (Path(folder) / "campaign.json").exists():
         return tb.resume(folder, **options)
-    return tb.iterate(robots.workspace, *ENDS, policy="thompson", directory=folder, **options)
+    options |= {"courses": COURSES, "policy": "thompson", "directory": folder}
+    return tb.iterate(robots.workspace, **options)
 
 
 def numbers(folder):

@@ -32,6 +32,8 @@ FAULTS = {
 }
 CALLS = ("open", "fdopen", "fsync", "replace", "rename", "mkdir", "unlink", "rmdir")
 OTHER = [(2, 0), (1, 0), (0, 1), (0, 2)]
+BACK = {"start": (0, 2), "goal": (2, 0), "robots": ("r1",)}
+"""Another course, of one robot."""
 
 
 class HalfWritten:
@@ -103,17 +105,18 @@ def mission(workspace):
 
 @pytest.fixture(scope="module")
 def template(workspace, tmp_path_factory):
-    """Folder of a campaign with two missions and a plan."""
+    """Folder of a campaign with two missions, one of them on another course, and a plan."""
     folder = tmp_path_factory.mktemp("faults") / "template"
     with begin(workspace, folder) as campaign:
-        for seed in range(2):
-            told = ModelSimulator(workspace, blind=True).run(campaign.ask().path, seed=seed)
-            campaign.tell(told)
+        for seed, course in enumerate(({}, BACK)):
+            plan = campaign.ask(**course)
+            told = ModelSimulator(workspace, blind=True).run(plan.path, seed=seed)
+            campaign.tell(told.of_robots(plan.robots))
         campaign.ask()
     return folder
 
 
-OPERATIONS = "tell", "fail", "exclude", "withdraw", "suggest", "replan", "ask"
+OPERATIONS = "tell", "fail", "exclude", "withdraw", "suggest", "replan", "ask", "ask back"
 
 
 def operations(campaign, mission):
@@ -136,12 +139,13 @@ def operations(campaign, mission):
         "suggest": lambda: campaign.suggest(OTHER),
         "replan": lambda: campaign.replan((2, 0), blocked=[campaign.ask().path[:2]]),
         "ask": ask,
+        "ask back": lambda: campaign.ask(**BACK),
     }
 
 
 def summary(campaign):
     state = campaign.state
-    asked = None if state.asked is None else state.asked.path
+    asked = None if state.asked is None else (state.asked.path, state.asked.robots)
     counted = tuple(entry.why_excluded is not None for entry in state.entries)
     failures = tuple(bool(failure.withdrawn) for failure in state.failures)
     return counted, failures, asked
