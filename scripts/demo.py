@@ -67,7 +67,7 @@ def main() -> None:
     lost = table["contact_lost"].to_numpy()
     print(
         f"{(table['status'] == 'ok').sum()} of {MISSIONS} missions arrived; the recommended path "
-        f"arrives with probability {campaign.plan.p_arrive:.2f}"
+        f"arrives with probability {campaign.plan().p_arrive:.2f}"
     )
     print(
         f"contact lost in mission 1, with scrub that the map does not show: {lost[0]:.1f} of "
@@ -106,7 +106,7 @@ def draw(
         figure, axes = plt.subplots(2, 2, figsize=(8.0, 6.8), layout="constrained")
         figure.get_layout_engine().set(h_pad=0.08)
         (bound, lost), maps = axes
-        draw_bound(bound, result.plan)
+        draw_bound(bound, result.plan())
         draw_trust(figure, maps, result, center)
         worlds = {"old survey": (changed, result), "map is right": (right, known)}
         for colour, (label, world) in zip((ROBOTS[1], ROBOTS[0]), worlds.items(), strict=True):

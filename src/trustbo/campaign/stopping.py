@@ -82,7 +82,7 @@ class RegretBound:
     def probability(self, campaign: Result, n_missions: int, course: Course | None = None) -> float:
         """Compute P(regret of the recommended path <= eps) after the first `n_missions`.
 
-        The path is that of a course of the campaign, by default the one of `Result.plan`.
+        The path is that of a course of the campaign, by default the one of `Result.plan()`.
         """
         posterior = campaign.state.entries[n_missions - 1].posterior
         if posterior is None:
