@@ -2,14 +2,17 @@
 
     python scripts/figures.py [--out docs/figures]
 
-`robot_trust.png` is drawn by the example of the page "Trust of one robot at one place".
+`robot_trust.png` is drawn by the example of the page "Trust of one robot at one place", and
+`several_courses.png` shows the campaign of the page "Several courses on one ground".
 """
 
 import argparse
 import contextlib
 import re
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
@@ -17,14 +20,16 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 import trustbo as tb
 from trustbo.plots.maps import draw_scale
 from trustbo.plots.plan import draw_ground
-from trustbo.plots.style import GREY, RC, robot_looks
+from trustbo.plots.style import GREY, RC, outlined, robot_looks
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 EXAMPLE = DOCS / "howto" / "trust-of-one-robot-at-one-place.md"
+COURSES = DOCS / "howto" / "several-courses.md"
 START, GOAL = (9, 0), (0, 9)
 BOUND = 11
 """Number of the bound of the first plan that is drawn, from 1."""
@@ -37,6 +42,7 @@ REACHED = 3
 POSTS = np.array([(-0.3, -0.3), (-0.1, 0.25), (0.35, 0.3)])
 """Posts in the sketch, from the centre of that cell, as fractions of a cell."""
 DASHED = (0, (3, 1.5))
+OUTLINE = outlined(3.4, "white")
 
 
 def main() -> None:
@@ -55,15 +61,60 @@ def main() -> None:
         save(overwatch(), out / "paper_overwatch.png")
         save(cloud(terrain), out / "paper_cloud.png")
 
-    code = re.findall(r"```python\n(.*?)```", EXAMPLE.read_text(), re.DOTALL)
-    with contextlib.chdir(out):
-        exec("\n".join(code), {})  # saves robot_trust.png
+    run_example(EXAMPLE, out)  # saves robot_trust.png
+    with tempfile.TemporaryDirectory() as folder:
+        names = run_example(COURSES, Path(folder))
+        with mpl.rc_context({**RC, "font.size": 9.0, "legend.fontsize": 9.0}):
+            save(courses(names), out / "several_courses.png")
+
+
+def run_example(page: Path, folder: Path) -> dict[str, Any]:
+    """Run the examples of a page in a folder; return the names that they define."""
+    code = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    names: dict[str, Any] = {}
+    with contextlib.chdir(folder):
+        exec("\n".join(code), names)
+    return names
 
 
 def save(figure: Figure, file: Path) -> None:
     """Save a figure at the size at which pages show it."""
     figure.savefig(file, dpi=110, facecolor="white")
     print(f"the picture is in {file}")
+
+
+def courses(names: dict[str, Any]) -> Figure:
+    """Draw paths of two courses, and trust before and after the missions on the first course."""
+    workspace, campaign, ends = names["workspace"], names["campaign"], (names["A"], names["B"])
+    new = tb.Campaign(workspace)
+    first = [new.plan(*course).path for course in ends]
+    driven = [mission.path for mission in campaign.missions[:6]]
+    n_first = sum(path[0] == ends[0][0] for path in driven)
+    planner = tb.Planner(workspace, *ends[0])
+    beliefs = new.belief, campaign.posteriors[n_first - 1]
+
+    figure, axes = plt.subplots(1, 2, figsize=(7.6, 4.1), layout="compressed")
+    for ax, belief, paths in zip(axes, beliefs, (first, driven), strict=True):
+        trust = planner.robot_maps(belief)["trust_mean"].mean("robot")
+        label = "" if paths is first else "mean trust in r1, r2 and r3"
+        tb.plots.cell_map(trust, workspace, limits=(0.1, 1.0), label=label, ax=ax)
+        centre = workspace.grid.center(names["shared"]) - workspace.grid.corner
+        ax.add_patch(Circle(centre, names["jammer"].radius, fill=False, ec="white", ls=":", lw=1.5))
+        for path in paths:
+            places = [workspace.grid.center(cell) for cell in path] - workspace.grid.corner
+            k = int(path[0] != ends[0][0])
+            look = {"color": ("tab:red", "black")[k], "zorder": 5, "path_effects": OUTLINE}
+            style = "--" if paths is first else "-"
+            ax.plot(*places.T, style, lw=2.0, label=f"course {'AB'[k]}", **look)
+            ax.plot(*places[0], "o", ms=6, **look)
+            ax.plot(*places[-1], "*", ms=10, **look)
+
+    axes[0].set_title("before the first mission, with plans")
+    axes[1].set_title("after four missions on A, with driven paths")
+    handles, labels = axes[1].get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    figure.legend(unique.values(), unique, loc="outside lower center", ncols=2)
+    return figure
 
 
 def bound(plan: tb.planning.Plan, k: int = BOUND) -> Figure:
