@@ -99,9 +99,11 @@ def courses(names: dict[str, Any]) -> Figure:
         label = "" if paths is first else "mean trust in r1, r2 and r3"
         tb.plots.cell_map(trust, workspace, limits=(0.1, 1.0), label=label, ax=ax)
         centre = workspace.grid.center(names["shared"]) - np.array(workspace.grid.corner)
-        ax.add_patch(Circle(centre, names["jammer"].radius, fill=False, ec="white", ls=":", lw=1.5))
+        look = {"ec": "white", "ls": ":", "lw": 1.5, "path_effects": outlined(3.0, "dimgrey")}
+        ax.add_patch(Circle(centre, names["jammer"].radius, fill=False, **look))
         for path in paths:
-            places = np.array([workspace.grid.center(cell) for cell in path]) - workspace.grid.corner
+            places = np.array([workspace.grid.center(cell) for cell in path])
+            places -= workspace.grid.corner
             k = int(path[0] != ends[0][0])
             look = {"color": ("tab:red", "black")[k], "zorder": 5, "path_effects": OUTLINE}
             style = "--" if paths is first else "-"
