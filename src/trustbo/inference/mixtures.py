@@ -463,6 +463,8 @@ def _searched(
     while True:
         rounds.add(mixture, BATCH, log_density, rng)
         visited.append(rounds.newest)
+        if not np.isfinite(rounds.log_p).any():  # there is nothing to fit a mixture to
+            return mixture, _FIRST_LOG_BETA, _joined(visited, -np.inf)
 
         path = _Path(rounds, origin)
         part = _STEP if d > _MOST_STRICT else max(0.5 ** (n_idle // _PATIENT), _STEP)
@@ -481,8 +483,13 @@ def _searched(
         is_ripe = n_idle >= _RIPE_ROUNDS or progress > np.log(_RIPE)
         has_failed = n_idle > _STALLED or len(visited) * BATCH >= _MOST_SEARCHED
         if (log_beta == 0.0 and is_ripe) or has_failed:
-            x, log_p = (np.concatenate(parts) for parts in zip(*visited, strict=True))
-            return mixture, log_beta, Visited(x, log_p, path.log_evidence)
+            return mixture, log_beta, _joined(visited, path.log_evidence)
+
+
+def _joined(parts: Sequence[tuple[np.ndarray, np.ndarray]], log_evidence: float) -> Visited:
+    """Join the points of all rounds."""
+    x, log_p = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return Visited(x, log_p, log_evidence)
 
 
 def lost_modes(visited: Visited, found: Mixture, log_density: LogDensity) -> np.ndarray:

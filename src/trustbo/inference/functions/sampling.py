@@ -207,6 +207,8 @@ def sampled(
     sampler = options.sampler
     seed = options.seed
     known = _values_of(options.start, target, seed)
+    if known is not None and not _is_possible(target, known):
+        known = None
     found = None
     if sampler != NUTS or known is None:  # also for the starts of NUTS
         starts = [prior] if known is None else [known, prior]
@@ -224,9 +226,12 @@ def sampled(
         x = found.x[found.resample(_N_STARTS, stream(seed, "starts of chains"))]
     start = Start.near(x, options.chains, seed)
     warmup = _WARMUP if options.warmup is None else options.warmup
-    return _by_nuts(
+    drawn = _by_nuts(
         target, start, warmup, draws, seed=seed, progress=options.progress, check=options.check
     )
+    if drawn.complaints and options.check and found is None:  # the start may be far away
+        return sampled(targets, prior, draws, options._replace(start=None))
+    return drawn
 
 
 def _chart(
@@ -285,6 +290,12 @@ def _values_of(
                 drawn[name] = drawn[name].copy()
                 drawn[name][(slice(None), *map(slice, shape))] = values[name]
     return drawn
+
+
+def _is_possible(target: Target, values: Mapping[str, np.ndarray]) -> bool:
+    """Return whether any draw of the variables has a positive density."""
+    x = target.finite_points(values)[: mixtures.BATCH]
+    return len(x) > 0 and bool(np.isfinite(target.log_density(x)).any())
 
 
 def _resampled(target: Target, found: mixtures.Sample, n: int, seed: int) -> Drawn:
