@@ -1,0 +1,222 @@
+"""Fits that start from a posterior which the new missions contradict, in every sampler."""
+
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+import xarray as xr
+from scipy import stats
+
+import trustbo as tb
+from trustbo.inference import importance, mixtures
+from trustbo.inference.importance import Student
+from trustbo.models import ContactRate, PlaceEffect, PooledTrust
+
+QUIET = {"latent": False, "progress": False}
+LIMIT = 0.34
+"""Largest difference of means from those without start, in standard deviations."""
+FAMILIES = ("gaussian", "censored", "beta_binomial")
+
+
+def mission(rates, *, seed=0, noise=0.02):
+    """Mission of two robots with rates (bound,) near those given, in shares of 100 ticks."""
+    rng = np.random.default_rng(seed)
+    shape = len(rates), 2
+    y = np.clip(np.array(rates)[:, None] + noise * rng.standard_normal(shape), 0.0, 1.0)
+    path = [(0, k) for k in range(len(rates) + 1)]
+    n_ticks = np.full(shape, 100.0)
+    z = rng.uniform(size=(*shape, 2))
+    return tb.Mission.from_arrays(path, z, np.round(y, 2), n_ticks=n_ticks)
+
+
+@pytest.fixture(scope="module")
+def contradicting():
+    """A mission in whole contact, and one that loses it on the way and finds it again."""
+    whole = mission([1.0] * 12, noise=0.05)
+    lost = mission([0.98, 0.9, 0.45, 0.22, 0.2, 0.2, 0.8, 1.0, 0.98, 0.96], seed=1, noise=0.03)
+    return whole, lost
+
+
+def linear(awareness, contact_rate=None, n_ticks=None):
+    """Drift that is linear in the features, as a NumPyro function."""
+    beta0 = numpyro.sample("beta0", dist.Beta(2.0, 2.0))
+    weight = numpyro.sample("weight", dist.Normal(0.0, 0.5).expand([2]).to_event(1))
+    level = numpyro.sample("level", dist.Normal(0.0, 0.3))
+    noise = numpyro.sample("noise", dist.HalfNormal(0.3))
+    with numpyro.plate("mission", len(awareness)):
+        rates = ContactRate(awareness @ weight + level, beta0, noise, 0.05, n_ticks=n_ticks)
+        numpyro.sample("contact_rate", rates, obs=contact_rate)
+
+
+def assert_same_means(found, other, limit=LIMIT):
+    """The means of all parameters differ by little, in standard deviations."""
+    over = ("chain", "draw")
+    one, two = found["posterior"].to_dataset(), other["posterior"].to_dataset()
+    gap = abs(one.mean(over) - two.mean(over)) / two.std(over)
+    assert float(gap.to_dataarray().max()) < limit
+
+
+def with_proposal(posterior, change):
+    """The posterior with another stored proposal."""
+    changed = posterior.copy(deep=True)
+    proposal = Student.from_text(posterior["sample_stats"].attrs["proposal"])
+    changed["sample_stats"].attrs["proposal"] = change(proposal).text
+    return changed
+
+
+def with_draws(posterior, change):
+    """The posterior with other draws."""
+    changed = posterior.copy(deep=True)
+    changed["posterior"].dataset = change(posterior["posterior"].to_dataset())
+    return changed
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_start_that_the_new_mission_contradicts_gives_the_same_posterior(contradicting, family):
+    model = PooledTrust(family=family)
+    plain = tb.fit(contradicting, model, **QUIET)
+
+    first = tb.fit(contradicting[:1], model, seed=3, **QUIET)
+    for seed in range(4):
+        found = tb.fit(contradicting, model, seed=seed, start=first, **QUIET)
+        assert_same_means(found, plain)
+
+
+def test_a_start_with_effects_of_places_gives_the_same_posterior(contradicting):
+    model = PooledTrust(effects=(PlaceEffect(),))
+    plain = tb.fit(contradicting, model, **QUIET)
+
+    first = tb.fit(contradicting[:1], model, seed=1, **QUIET)
+    for seed in range(4):
+        assert_same_means(tb.fit(contradicting, model, seed=seed, start=first, **QUIET), plain)
+
+
+def test_a_start_near_a_lower_mode_is_left():
+    model = PooledTrust(shared_noise=True)
+    whole = [mission([1.0] * 8, seed=k, noise=0.01) for k in range(2)]
+    none = [mission([0.0] * 8, seed=k, noise=0.1) for k in range(2, 5)]
+    plain = tb.fit(whole + none, model, **QUIET)
+
+    found = tb.fit(whole + none, model, start=tb.fit(whole, model, **QUIET), **QUIET)
+
+    assert found.attrs["log_evidence"] == pytest.approx(plain.attrs["log_evidence"], abs=0.3)
+    assert_same_means(found, plain)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda near: near._replace(center=near.center + 10.0),
+        lambda near: near._replace(center=near.center - 1e3),
+        lambda near: near._replace(center=near.center + 1e6),
+        lambda near: near._replace(center=near.center + 5.0).scaled(1e-2),
+        lambda near: near._replace(center=np.nan * near.center),
+        lambda near: near.scaled(1e-6),
+        lambda near: near.scaled(1e6),
+        lambda near: near.scaled(1e200),
+    ],
+    ids=["10 sds", "-1000 sds", "1e6 sds", "single", "nan", "1e-6", "1e6", "1e200"],
+)
+def test_a_proposal_far_away_or_of_another_scale_gives_the_same_posterior(
+    contradicting, family, change
+):
+    model = PooledTrust(family=family)
+    plain = tb.fit(contradicting, model, **QUIET)
+
+    found = tb.fit(contradicting, model, start=with_proposal(plain, change), **QUIET)
+
+    assert_same_means(found, plain)
+
+
+@pytest.fixture(scope="module")
+def of_function(contradicting):
+    """Posteriors of a function given both missions, and given the first one."""
+    first = tb.fit(contradicting[:1], linear, seed=1, **QUIET)
+    return tb.fit(contradicting, linear, **QUIET), first
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda draws: draws,
+        lambda draws: draws.assign(weight=draws["weight"] + 1e3),
+        lambda draws: draws.assign(level=draws["level"] + 1e200),
+        lambda draws: np.nan * draws,
+        lambda draws: xr.zeros_like(draws) + draws.isel(draw=0),
+        lambda draws: draws.assign(weight=1e5 * draws["weight"]),
+        lambda draws: draws.assign(noise=1e-12 * draws["noise"]),
+    ],
+    ids=["contradicting", "1000", "1e200", "nan", "single", "wide", "narrow"],
+)
+def test_a_function_has_the_same_posterior_from_any_start(contradicting, of_function, change):
+    plain, first = of_function
+
+    found = tb.fit(contradicting, linear, start=with_draws(first, change), **QUIET)
+
+    assert_same_means(found, plain)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shift", [0.0, 1e3, 1e200])
+def test_nuts_of_a_function_has_the_same_posterior_from_any_start(
+    contradicting, of_function, shift
+):
+    plain, first = of_function
+    start = with_draws(first, lambda draws: draws.assign(level=draws["level"] + shift))
+
+    found = tb.fit(contradicting, linear, sampler="nuts", start=start, **QUIET)
+
+    assert_same_means(found, plain)
+
+
+def test_weights_of_a_dominant_point_are_numbers_and_never_good():
+    rng = np.random.default_rng(0)
+    for scale in (10.0, 100.0, 300.0, 1e3, 1e5):
+        for _ in range(50):
+            log_ratio = -scale * rng.chisquare(5, 288)
+
+            weight, k_hat, _ = importance.smoothed(log_ratio)
+
+            assert weight.sum() == pytest.approx(1.0)
+            assert weight.argmax() == log_ratio.argmax()
+            assert k_hat > importance.MAX_KHAT or (weight**2).sum() < 0.5
+
+
+def test_points_of_a_far_first_proposal_are_marked():
+    def log_density(z):
+        return stats.norm.logpdf(z).sum(1)
+
+    starts, far = np.zeros((1, 3)), Student(np.full(3, 30.0), 0.1 * np.eye(3))
+    for first, is_far in ((far, True), (far._replace(center=np.zeros(3)).scaled(10.0), False)):
+        points = importance.sample(log_density, starts, np.random.default_rng(1), first=first)
+        assert points.is_far == is_far
+
+
+def test_points_at_one_mode_miss_a_higher_one():
+    def log_density(z):
+        low = stats.multivariate_normal([-3.0, 0.0], 0.01).logpdf(z)
+        high = stats.multivariate_normal([3.0, 0.0], 0.01).logpdf(z) + 20.0
+        return np.atleast_1d(np.logaddexp(low, high))
+
+    near_low = Student(np.array([-3.0, 0.0]), 0.1 * np.eye(2))
+    points = importance.sample(
+        log_density, np.zeros((1, 2)), np.random.default_rng(1),
+        first=near_low, defensive=lambda proposal: proposal,
+    )  # fmt: skip
+
+    assert points.misses(log_density, np.array([3.0, 0.0]))
+    assert not points.misses(log_density, np.array([-3.0, 0.0]))
+
+
+def test_a_mixture_without_a_point_of_positive_density_is_complained_of():
+    def log_density(x):
+        return np.where((np.abs(x - 60.0) < 0.1).all(1), 0.0, -np.inf)
+
+    start = np.random.default_rng(0).standard_normal((500, 2))
+    chart = mixtures.Chart(log_density, [start], lambda x: x, lambda x: x)
+
+    found = mixtures.sample([chart], seed=1)
+
+    assert found.complaints != []
+    assert np.isfinite(found.weight).all()
