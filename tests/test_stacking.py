@@ -93,6 +93,12 @@ def written(missions, folder):
     return tb.logs.read_missions(folder / "missions.nc")
 
 
+def watched(posterior, workspace, missions):
+    path = [(2, 0), (1, 1), (0, 2)]
+    planner = tb.Planner(workspace, path[0], path[-1])
+    return planner.watchers(path, posterior, missions=missions)
+
+
 CALLS = {
     "fit": lambda m, r: few_draws(m)["posterior"].to_dataset(),
     "fit_hazard": lambda m, r: tb.hazard.fit_hazard(m, random_cells(n=10))["intercept"],
@@ -108,9 +114,12 @@ CALLS = {
     "RealtimeAwareness": lambda m, r: tb.simulation.RealtimeAwareness(r("driven")[0], m).describe(),
     "threat_map": lambda m, r: tb.planning.threat_map(m, *r("placed"))["probability"],
     "predict_reports": lambda m, r: tb.inference.predict_reports(r("of_people"), m, n_draws=20),
+    "contact_dependence": lambda m, r: tb.planning.contact_dependence(m),
+    "Planner.watchers": lambda m, r: watched(*r("placed"), m),
 }
 """Calls with missions that return what they depend on."""
 OTHERS = {"RealtimeAwareness": "driven", "threat_map": "driven",
+          "contact_dependence": "driven", "Planner.watchers": "driven",
           "HumanTrust.observations": "people",
           "predict_reports": "people"}  # fmt: skip
 """Fixtures of calls that need other missions."""
