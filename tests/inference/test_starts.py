@@ -181,7 +181,7 @@ def test_ratios_whose_tail_has_no_pareto_fit_have_their_own_weights(scale, seed)
 
 
 def test_points_of_a_far_first_proposal_are_marked():
-    """The density is narrow, so that points of the prior, which are always drawn, do not reach it."""
+    """The density is narrow, so that the points of the prior, which are drawn too, miss it."""
 
     def log_density(z):
         return stats.norm.logpdf(z, 2.0, 0.01).sum(1)
