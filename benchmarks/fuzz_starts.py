@@ -4,8 +4,9 @@
 
 Each case draws a model and two groups of missions. They vary the kind of model (equal, different or
 coupled robots, people, a NumPyro function), the family of the rates, the number of robots, effects,
-what lasts, shared noise, and the level of contact. The levels of the two groups contradict each
-other; for example, contact is whole in the first group and almost none in the second. A posterior
+what lasts, shared noise, and the level of contact. Four coupled robots with rates that are not
+Gaussian are left out, as their fits take a minute each. The levels of the two groups contradict
+each other; for example, contact is whole in the first group and almost none in the second. A posterior
 of the first group is the start of fits of both groups together, with four seeds.
 
 Each mean is compared with the mean of two fits without start, in standard deviations of these. The
@@ -194,6 +195,12 @@ def case_of(seed, index):
     return Case(f"{name}, {', '.join(words)}", kind, model, first, new)
 
 
+def is_slow(case):
+    """Return whether the fits of a case take very long."""
+    is_coupled = isinstance(case.model, tb.models.CoupledTrust)
+    return is_coupled and case.model.family != "gaussian" and len(case.first[0].robots) > 3
+
+
 def fitted(missions, case, seed, start=None):
     """Fit missions without latent trust."""
     return tb.fit(missions, case.model, seed=seed, start=start, latent=False, progress=False)
@@ -296,7 +303,7 @@ def main():
     index = given.first
     while n_done < n_fits:
         case = case_of(given.seed, index)
-        if case.kind in given.names:
+        if case.kind in given.names and not is_slow(case):
             outcome = outcome_of(case)
             by_kind[case.kind].append(outcome)
             n_done += N_STARTED

@@ -15,7 +15,53 @@ from trustbo.models import ContactRate, PlaceEffect, PooledTrust
 QUIET = {"latent": False, "progress": False}
 LIMIT = 0.34
 """Largest difference of means from those without start, in standard deviations."""
+FEATURES = ("traversability", "visibility", "line_of_sight")
 FAMILIES = ("gaussian", "censored", "beta_binomial")
+
+
+WHOLE = """
+17
+18     131  131 125 130    67  62  97  58  62  98  78  62  98
+19      94   93  94  93    68  81 100  64  81  99  60  81 100
+29     134  134 134 134    73  80 100  71  80 100  66  80 100
+39     121  121 121 121    59  69 100  57  69 100  61  69 100
+49     150  150 148 147    42  53 100  41  53 100  54  53  99
+59     106   90 102 104    70  54  93  68  54  95  68  54  99
+58      55   55  55  55    82  23  99  77  23 100  82  23  99
+69     120  120 120 117    53  65 100  65  65 100  56  65 100
+68      89   89  89  89    55  59 100  46  59 100  49  59 100
+77     170  166 166 167    60  55  99  51  55  99  51  55 100
+87     149  130 131 133    44  32  86  39  32  88  47  32  84
+97      88   86  86  82    61  21  91  57  21  92  45  21  89
+"""
+LOST = """
+04
+14     118  116 115 118    56  14  96  52  14  95  47  14  97
+24     131  113 121 125    57  18  84  51  18  93  55  18  93
+34     143   64  67  60    57  37  94  54  37  94  61  37  92
+43     132   28  29  34    64  75 100  63  75 100  72  75 100
+54     188   39  41  40    78  65 100  73  65 100  77  65 100
+65     110   27  21  17    66  59 100  67  59 100  62  59 100
+74     156   94 149 147    61  78 100  63  78 100  66  78 100
+84      94   94  94  94    70  77 100  71  77 100  66  77 100
+95     186  184 181 186    63  60  99  52  60  99  59  60  99
+86     100   94  97 100    47  22  94  46  22  95  60  22  95
+"""
+"""Two missions of three robots over one terrain. Each row has the row and column of a cell, the
+ticks of the bound into it, the ticks in contact of each robot, and three features of each robot in
+percent."""
+
+
+def read(text):
+    """Mission of a table of bounds; the first row is the start."""
+    start, *bounds = (line.split() for line in text.strip().splitlines())
+    path = [(int(cell[0]), int(cell[1])) for cell in (start[0], *(row[0] for row in bounds))]
+    rows = np.array([row[1:] for row in bounds], dtype=float)
+
+    n_ticks = np.repeat(rows[:, :1], 3, axis=1)
+    awareness = rows[:, 4:].reshape(len(rows), 3, 3) / 100.0
+    rates = rows[:, 1:4] / n_ticks
+    return tb.Mission.from_arrays(path, awareness, rates, n_ticks=n_ticks, features=FEATURES)
 
 
 def mission(rates, *, seed=0, noise=0.02):
@@ -82,6 +128,16 @@ def test_a_start_that_the_new_mission_contradicts_gives_the_same_posterior(contr
         assert_same_means(found, plain)
 
 
+@pytest.mark.parametrize(("first_seed", "seed"), [(1, 2), (2, 0), (2, 3), (3, 2)])
+def test_a_start_without_an_effective_point_gives_the_same_posterior(first_seed, seed):
+    missions = [read(WHOLE), read(LOST)]
+    plain = tb.fit(missions, **QUIET)
+
+    first = tb.fit(missions[:1], seed=first_seed, **QUIET)
+
+    assert_same_means(tb.fit(missions, seed=seed, start=first, **QUIET), plain)
+
+
 def test_a_start_with_effects_of_places_gives_the_same_posterior(contradicting):
     model = PooledTrust(effects=(PlaceEffect(),))
     plain = tb.fit(contradicting, model, **QUIET)
@@ -94,7 +150,7 @@ def test_a_start_with_effects_of_places_gives_the_same_posterior(contradicting):
 def test_a_start_near_a_lower_mode_is_left():
     model = PooledTrust(shared_noise=True)
     whole = [mission([1.0] * 8, seed=k, noise=0.01) for k in range(2)]
-    none = [mission([0.0] * 8, seed=k, noise=0.1) for k in range(2, 5)]
+    none = [mission([0.05 * (k % 2)] * 8, seed=k, noise=0.02) for k in range(2, 5)]
     plain = tb.fit(whole + none, model, **QUIET)
 
     found = tb.fit(whole + none, model, start=tb.fit(whole, model, **QUIET), **QUIET)
@@ -181,13 +237,13 @@ def test_ratios_whose_tail_has_no_pareto_fit_have_their_own_weights(scale, seed)
 
 
 def test_points_of_a_far_first_proposal_are_marked():
-    """The density is narrow, so that the points of the prior, which are drawn too, miss it."""
-
     def log_density(z):
-        return stats.norm.logpdf(z, 2.0, 0.01).sum(1)
+        return stats.norm(scale=0.02).logpdf(z).sum(1)
 
-    starts, near = np.full((1, 3), 2.0), Student(np.full(3, 2.0), 0.01 * np.eye(3))
-    for first, is_far in ((near._replace(center=np.full(3, 30.0)), True), (near, False)):
+    starts = np.zeros((1, 3))
+    near = Student(np.zeros(3), 0.03 * np.eye(3))
+    far = Student(np.full(3, 2.0), 0.03 * np.eye(3))
+    for first, is_far in ((near, False), (far, True)):
         points = importance.sample(log_density, starts, np.random.default_rng(1), first=first)
         assert points.is_far == is_far
 
