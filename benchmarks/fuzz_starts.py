@@ -6,8 +6,8 @@ Each case draws a model and two groups of missions. They vary the kind of model 
 coupled robots, people, a NumPyro function), the family of the rates, the number of robots, effects,
 what lasts, shared noise, and the level of contact. Four coupled robots with rates that are not
 Gaussian are left out, as their fits take a minute each. The levels of the two groups contradict
-each other; for example, contact is whole in the first group and almost none in the second. A posterior
-of the first group is the start of fits of both groups together, with four seeds.
+each other; for example, contact is whole in the first group and almost none in the second. A
+posterior of the first group is the start of fits of both groups together, with four seeds.
 
 Each mean is compared with the mean of two fits without start, in standard deviations of these. The
 largest difference of all parameters counts, and it should be at most a third of a standard

@@ -88,7 +88,7 @@ def fit(
         latent: Whether to add latent trust, log-likelihoods and predictions, as `add_latent` does.
         start: Posterior of the same model given similar data, such as all missions but the last.
             Importance sampling then begins with the proposal of this posterior instead of a search
-            for the mode.
+            for the mode. The search follows if this posterior turns out to be far away.
 
     Returns:
         An ArviZ DataTree. `posterior` contains the parameters (for `PooledTrust`, these are beta0,

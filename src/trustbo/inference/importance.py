@@ -244,7 +244,13 @@ class Points(NamedTuple):
 
     @property
     def proposal(self) -> Student:
-        """Fit a Student-t to the points; if few points dominate, flatten their weights."""
+        """Fit a Student-t to the points; if few points dominate, flatten their weights.
+
+        If no point has a positive density, there is nothing to fit, and it is `near`.
+        """
+        if not np.isfinite(self.log_ratio).any():
+            return self.near
+
         weight = self.weight
         for _ in range(_FLATTENED):
             if (weight**2).sum() * self._n_for_moments <= 1.0:
