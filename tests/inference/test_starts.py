@@ -147,6 +147,19 @@ def test_a_start_with_effects_of_places_gives_the_same_posterior(contradicting):
         assert_same_means(tb.fit(contradicting, model, seed=seed, start=first, **QUIET), plain)
 
 
+def test_a_start_on_whose_way_too_few_points_are_effective_is_left():
+    model = PooledTrust(shared_noise=True, effects=(PlaceEffect(),))
+    whole = [mission([1.0] * 8, seed=k) for k in (30, 31)]
+    other = mission(np.random.default_rng(3).uniform(size=9), seed=8, noise=0.3)
+    plain = tb.fit([*whole, other], model, **QUIET)
+
+    first = tb.fit(whole, model, **QUIET)
+    for seed in range(4):
+        found = tb.fit([*whole, other], model, seed=seed, start=first, **QUIET)
+        assert found.attrs["kish"] >= importance.ENOUGH
+        assert_same_means(found, plain)
+
+
 def test_a_start_near_a_lower_mode_is_left():
     model = PooledTrust(shared_noise=True)
     whole = [mission([1.0] * 8, seed=k, noise=0.01) for k in range(2)]

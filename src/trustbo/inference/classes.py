@@ -16,6 +16,7 @@ from trustbo.inference import ep
 from trustbo.inference.density import Coefficients, Density, JointDraws, at
 from trustbo.inference.engine import inputs
 from trustbo.inference.importance import (
+    ENOUGH,
     MAX_KHAT,
     ROUNDS,
     Points,
@@ -190,14 +191,17 @@ def _is_possible(density: Density, first: Student) -> bool:
 def _is_elsewhere(density: Density, points: Points) -> bool:
     """Return whether points whose first proposal was far away do not represent the posterior.
 
-    They may be at a lower mode than the search for the mode finds. Unless rates are Gaussian, their
-    density is that of EP near the first proposal, which is not accurate elsewhere.
+    They may be on the way to it, with too few effective points when the rounds end, or at a lower
+    mode than the search for the mode finds. Unless rates are Gaussian, their density is that of EP
+    near the first proposal, which is not accurate elsewhere.
     """
     if not density.is_gaussian:
         density.reset_ep()
         return True
     if points.k_hat > MAX_KHAT:
         return False  # the search follows in any case
+    if points.kish < ENOUGH:
+        return True
 
     mode = climb(density.log_density, density.start())
     return points.misses(density.log_density, mode)
