@@ -18,7 +18,7 @@ cost until one has happened. The baselines do not use a posterior of trust, and 
 residual process and the running mean plan with their means.
 
 Each campaign has a file in --out, so a run that was stopped continues where it was. With `--rows`,
-no campaign is run, and the tables are those of the rows of earlier runs.
+no campaign is run, and the tables are those of the means of earlier runs.
 """
 
 import sys
@@ -376,20 +376,31 @@ def groups_of(rows: pd.DataFrame) -> dict[str, pd.Series]:
     return {name: chosen for name, chosen in groups.items() if chosen.any()}
 
 
-def of_worlds(rows: pd.DataFrame, quantity: str = "excess") -> pd.DataFrame:
-    """Compute the mean of a quantity by world, with a column for each method.
+def means_of(rows: pd.DataFrame) -> pd.DataFrame:
+    """Average the rows of missions by world and method.
 
-    Only sets and missions that all methods have are used.
+    Only sets and missions that all methods have are used. The columns are world, kind, case,
+    method, `excess`, `late_excess` (missions from `LATE` on), `lost` and `arrives` of all missions,
+    and `first_arrives` and `first_predicted` of the first ones.
     """
-    index = ["world", "kind", "case", "set", "mission"]
-    wide = rows.pivot_table(quantity, index, "method").dropna()
-    wide = wide[[name for name in METHODS if name in wide]]
-    return wide.groupby(level=["world", "kind", "case"]).mean().reset_index()
+    n_methods = rows["method"].nunique()
+    of_mission = rows.groupby(["world", "case", "set", "mission"])["method"]
+    rows = rows[of_mission.transform("nunique") == n_methods]
+    rows = rows.assign(arrives=(rows["status"] == "ok").astype(float))
+
+    by = ["world", "kind", "case", "method"]
+    means = rows.groupby(by, sort=False)[["excess", "lost", "arrives"]].mean()
+    late, first = rows[rows["mission"] >= LATE], rows[rows["mission"] == 1]
+    of_first = first.groupby(by, sort=False)[["arrives", "p_arrive"]].mean()
+    means["late_excess"] = late.groupby(by, sort=False)["excess"].mean()
+    means[["first_arrives", "first_predicted"]] = of_first
+    return means.reset_index()
 
 
-def late(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of the missions from `LATE` on."""
-    return rows[rows["mission"] >= LATE]
+def of_worlds(means: pd.DataFrame, quantity: str = "excess") -> pd.DataFrame:
+    """Tabulate a quantity of `means_of` by world, with a column for each method."""
+    wide = means.pivot_table(quantity, ["world", "kind", "case"], "method", sort=False).dropna()
+    return wide[[name for name in METHODS if name in wide]].reset_index()
 
 
 def tests(excess: pd.DataFrame, ours: str) -> pd.DataFrame:
@@ -418,39 +429,37 @@ def tests(excess: pd.DataFrame, ours: str) -> pd.DataFrame:
     return pd.DataFrame(table, columns=head)
 
 
-def report(rows: pd.DataFrame) -> None:
+def report(means: pd.DataFrame) -> None:
     """Print all tables."""
-    n_missions = rows["mission"].max()
-    whole = {f"missions 1 to {n_missions}": rows, f"missions {LATE} to {n_missions}": late(rows)}
-    for when, some in whole.items():
-        if len(some):
-            print(f"\n**Excess, {when}**: bounds per mission, with failures\n")
-            print_means(of_worlds(some))
+    whole = {"all missions": "excess", f"missions from {LATE} on": "late_excess"}
+    whole = {when: name for when, name in whole.items() if means[name].notna().any()}
+    for when, name in whole.items():
+        print(f"\n**Excess, {when}**: bounds per mission, with failures\n")
+        print_means(of_worlds(means, name))
 
-    present = set(rows["method"])
+    present = set(means["method"])
     for ours in OURS:
         if ours not in present or not present & set(BASELINES):
             continue
-        for when, some in whole.items():
-            if len(some):
-                print(f"\n**{ours}, minus baselines, {when}** [95 %, t test by terrain]\n")
-                found = tests(of_worlds(some), ours)
-                print_tests(found)
-                print_targets(found)
+        for when, name in whole.items():
+            print(f"\n**{ours}, minus baselines, {when}** [95 %, t test by terrain]\n")
+            found = tests(of_worlds(means, name), ours)
+            print_tests(found)
+            print_targets(found)
 
-    ok = rows.assign(arrived=(rows["status"] == "ok").astype(float))
-    first = ok[ok["mission"] == 1]
-    print("\n**First missions that arrive**\n")
-    print_means(of_worlds(first, "arrived"), 2)
-    print("\n**Predicted arrival of first missions**\n")
-    print_means(of_worlds(first, "p_arrive"), 2)
-    print("\n**Missions that arrive**\n")
-    print_means(of_worlds(ok, "arrived"), 2)
+    titles = {
+        "First missions that arrive": "first_arrives",
+        "Predicted arrival of first missions": "first_predicted",
+        "Missions that arrive": "arrives",
+    }
+    for title, name in titles.items():
+        print(f"\n**{title}**\n")
+        print_means(of_worlds(means, name), 2)
 
     pair = ["trustbo, explore", "trustbo, priced"]
     if present.issuperset(pair):
         print("\n**explore minus greedy**: excess in bounds per mission\n")
-        print_pair(rows[rows["method"].isin(pair)], *pair)
+        print_pair(means[means["method"].isin(pair)], *pair)
 
 
 def print_means(table: pd.DataFrame, places: int = 3) -> None:
@@ -486,10 +495,10 @@ def print_targets(found: pd.DataFrame) -> None:
     print(f"No group worse by more than {WORSE}: {verdict(not worse)} {', '.join(worse)}")
 
 
-def print_pair(rows: pd.DataFrame, ours: str, other: str) -> None:
+def print_pair(means: pd.DataFrame, ours: str, other: str) -> None:
     """Print the mean differences of two methods by group and kind."""
     printed = Table("group (worlds)", "difference [95 %]", "p")
-    table = of_worlds(rows)
+    table = of_worlds(means)
     for group, chosen in groups_of(table).items():
         some = table[chosen]
         less = (some[ours] - some[other]).to_numpy()
@@ -508,17 +517,17 @@ def main() -> None:
     parser.add_argument("--missions", type=int, default=MISSIONS, help=f"default {MISSIONS}")
     parser.add_argument("--truths", type=Path, default=Path("out/truths"), help="folder of truths")
     parser.add_argument("--jobs", type=int, default=-1, help="processes, default one per core")
-    parser.add_argument("--csv", type=Path, help="CSV file for the rows")
-    parser.add_argument("--rows", type=Path, action="append", help="CSV file with rows")
+    parser.add_argument("--csv", type=Path, help="CSV file for the means by world")
+    parser.add_argument("--rows", type=Path, action="append", help="CSV file with means")
     given = parsed(parser)
 
     if given.rows:
-        rows = pd.concat([pd.read_csv(file) for file in given.rows], ignore_index=True)
+        means = pd.concat([pd.read_csv(file) for file in given.rows], ignore_index=True)
     else:
-        rows = run(given)
+        means = means_of(run(given))
     if given.csv is not None:
-        write_text(given.csv, rows.to_csv(index=False))
-    report(rows)
+        write_text(given.csv, means.round(_DECIMALS).to_csv(index=False))
+    report(means)
 
 
 if __name__ == "__main__":

@@ -97,7 +97,7 @@ def made(excess):
         {
             "world": world.name, "kind": world.kind, "case": world.case, "set": which,
             "method": method, "mission": mission, "status": "ok", "p_arrive": 0.9,
-            "excess": excess(method, world) + mission,
+            "lost": 0.0, "excess": excess(method, world) + mission,
         }
         for world in worlds().values() for method in ("trustbo, priced", *METHODS)
         for which in (0, 1) for mission in (7, 8)
@@ -113,7 +113,7 @@ def test_differences_are_t_tests_of_means_by_world_clustered_by_terrain():
     def excess(method, world):
         return level[method] + own[world.name] * (method == METHODS[0])
 
-    found = patrols.tests(patrols.of_worlds(made(excess)), "trustbo, priced")
+    found = patrols.tests(patrols.of_worlds(patrols.means_of(made(excess))), "trustbo, priced")
     row = found[(found["group"] == "map wrong") & (found["other"] == METHODS[0])].iloc[0]
 
     # Written out for the worlds of this group: d of each world, sums of residuals by terrain.
@@ -138,11 +138,11 @@ def test_differences_are_t_tests_of_means_by_world_clustered_by_terrain():
 
 
 def test_limits_that_are_too_high_and_too_low_are_groups_of_their_own(capsys):
-    rows = made(lambda method, world: 0.0)
-    groups = patrols.groups_of(patrols.of_worlds(rows))
+    means = patrols.means_of(made(lambda method, world: 0.0))
+    groups = patrols.groups_of(patrols.of_worlds(means))
     n_low = sum("low-3" in world.case for world in worlds().values())
     assert groups["limit too low"].sum() == n_low
     assert groups["limit too high"].sum() == groups["wrong slope limit"].sum() - n_low
 
-    patrols.report(rows)
+    patrols.report(means)
     assert "limit too low" in capsys.readouterr().out
