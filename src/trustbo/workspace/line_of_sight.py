@@ -90,25 +90,27 @@ def onward_maps(posts: Posts, passable: np.ndarray, n_posts: int) -> np.ndarray:
     """
     exists = existing_bounds(passable)
     watching = _posts_of_ways(posts, exists, n_posts)
+    waiting = _sight_of_waiting(posts, watching)
     pairs = np.argwhere(possible_next(exists, n_posts)[..., :-1])
     n_ways = len(MOVES) * n_posts
     robots = posts.team.robots
     maps = np.full((len(robots), n_ways, *passable.shape, n_ways), np.nan, np.float32)
 
     def of_block(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return block.T, _sight_of_pairs(posts, watching, block)
+        return block.T, _sight_of_pairs(posts, watching, waiting, block)
 
     blocks = np.array_split(pairs, max(1, math.ceil(len(pairs) / _PAIRS)))
     for where, seen in in_order(of_block, blocks):
         maps[:, *where] = seen.T
 
-    for way, row, col in np.argwhere(np.tile(exists, (n_posts, 1, 1))).tolist():
-        down, right = MOVES[way % len(MOVES)]
+    for move, row, col in np.argwhere(exists).tolist():
+        down, right = MOVES[move]
         a = row - down, col - right
         ahead = [b for b in _cells_ahead(passable, a, (row, col)) if b is not None]
         moves = [MOVES.index((b[0] - row, b[1] - col)) for b in ahead]
         if moves:
-            maps[:, way, row, col] -= maps[:, way, row, col, moves].mean(-1, keepdims=True)
+            of_sets = maps[:, move :: len(MOVES), row, col]  # (robot, set, next way)
+            of_sets -= of_sets[..., moves].mean(-1, keepdims=True)
     return maps
 
 
@@ -124,7 +126,22 @@ def _posts_of_ways(posts: Posts, exists: np.ndarray, n_posts: int) -> np.ndarray
     return places
 
 
-def _sight_of_pairs(posts: Posts, watching: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+def _sight_of_waiting(posts: Posts, watching: np.ndarray) -> np.ndarray:
+    """Compute how well the lead sees T2 at its posts of each way out, (way, row, col, robot)."""
+    seen = np.full(watching.shape[:-1], np.nan)
+    ways = np.argwhere(np.isfinite(watching[..., 0, 0]))
+    stops = np.array([posts.stop((row, col)) for _, row, col in ways.tolist()])
+    for i, robot in enumerate(posts.team.robots):
+        places = watching[*ways.T, i]
+        view = optics(posts.team.lead, robot)
+        found = detection_between(posts.surface, posts.sight, stops, places, view)
+        seen[*ways.T, i] = posts.team.lead.detection * found
+    return seen
+
+
+def _sight_of_pairs(
+    posts: Posts, watching: np.ndarray, waiting: np.ndarray, pairs: np.ndarray
+) -> np.ndarray:
     """Compute the line of sight (pair, robot) of ways, rows, columns and next ways (pair, 4)."""
     # What does not depend on the next way is computed once for each bound and set of posts.
     bounds, index = np.unique(pairs[:, :3], axis=0, return_inverse=True)
@@ -147,7 +164,8 @@ def _sight_of_pairs(posts: Posts, watching: np.ndarray, pairs: np.ndarray) -> np
         watched.append(robot.detection * lead_time * found)
 
     start = from_posts[index]
-    end = watching[pairs[:, 3], *pairs[:, 1:3].T]
+    onward = pairs[:, 3], *pairs[:, 1:3].T
+    end, at_end = watching[onward], waiting[onward]
     stop = np.array([posts.stop(c) for _, c in cells])[index]
     first, last = (np.stack([route[k] for route in routes])[index] for k in (0, -1))
 
@@ -160,11 +178,10 @@ def _sight_of_pairs(posts: Posts, watching: np.ndarray, pairs: np.ndarray) -> np
     seen = np.empty(times.shape)
     for i, (robot, (route, _)) in enumerate(zip(posts.team.robots, drives, strict=True)):
         shift = (1.0 - share) * (start[:, i] - first)[:, None] + share * (end[:, i] - last)[:, None]
-        places = np.concatenate([route[index] + shift, end[:, i, None]], axis=1)
         view = optics(lead, robot)
-        found = lead.detection * detection_between(surface, sight, stop[:, None], places, view)
-        closing, waiting = found[:, :-1].mean(1), found[:, -1]
-        seen[:, i] = times[:, i] * closing + (slowest - times[:, i]) * waiting
+        found = detection_between(surface, sight, stop[:, None], route[index] + shift, view)
+        closing = (lead.detection * found).mean(1)
+        seen[:, i] = times[:, i] * closing + (slowest - times[:, i]) * at_end[:, i]
         seen[:, i] += watched[i][index]
     return seen / (lead_time[index] + slowest)[:, None]
 

@@ -24,8 +24,10 @@ choice. Campaigns store line of sight, but not the posts. After a change of the 
 sight that was stored before is that of other posts.
 """
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable
 from copy import copy
+from functools import cache
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -95,6 +97,27 @@ SETS = dict(
 """Sets of posts, keyed by name; the order is that in which a workspace offers them."""
 
 
+class _View(NamedTuple):
+    """What the choice of posts in a cell needs, for all sets."""
+
+    ahead: list[Cell | None]  # next cells; None for the end of the path
+    stops: np.ndarray  # of the lead in the cell and in the next cells, (1 + next cell, 2)
+    points: np.ndarray  # of the lead's routes to the next cells, (point, 2)
+    first: np.ndarray  # position in `points` of the first point of each route, and their number
+    aims: np.ndarray  # positions of the lead on its routes, (next cell, aim, 2)
+    safe: np.ndarray  # mask of the safe pixels that are connected to the stop
+    corner: tuple[int, int]  # first row and column of this mask
+
+
+@cache
+def _lattice_offsets(radius: float) -> np.ndarray:
+    """Return the offsets of a lattice from a stop, (position, 2), m."""
+    steps = np.arange(-radius, radius + 1e-9, _STEP)
+    offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    distance = np.linalg.norm(offset, axis=1)
+    return offset[(distance <= radius) & (distance >= SPACING)]
+
+
 class Posts:
     """Stops, posts and routes of a team on a grid; positions are x and y in CRS metres.
 
@@ -131,6 +154,8 @@ class Posts:
 
         self._central = self._central_stops(traversability)
         self._stops: dict[Cell, np.ndarray] = {}
+        self._lines: dict[tuple[Cell, Cell], np.ndarray] = {}
+        self._views: dict[Cell, _View] = {}
         self._posts: dict[tuple[Cell, Cell | None, str], np.ndarray] = {}
 
     def of_robots(self, names: Iterable[str]) -> Self:
@@ -147,14 +172,16 @@ class Posts:
 
     def window(self, *stations: Station) -> Window:
         """Return the pixel window that contains cells and a margin of half a cell around them."""
-        cells = [station[:2] for station in stations]
-        rows, cols = self.surface.ground.shape
-        shape = np.array(self.grid.shape)
-
-        size = np.array([rows, cols]) / shape
-        top, left = ((np.min(cells, axis=0) - 0.5) * size).astype(int).tolist()
-        bottom, right = np.ceil((np.max(cells, axis=0) + 1.5) * size).astype(int).tolist()
-        return max(0, top), min(rows, bottom), max(0, left), min(cols, right)
+        window = []
+        for axis, (n_pixels, n_cells) in enumerate(
+            zip(self.surface.ground.shape, self.grid.shape, strict=True)
+        ):
+            size = n_pixels / n_cells
+            cells = [station[axis] for station in stations]
+            first = int((min(cells) - 0.5) * size)
+            end = math.ceil((max(cells) + 1.5) * size)
+            window += [max(0, first), min(n_pixels, end)]
+        return window[0], window[1], window[2], window[3]
 
     def linked_bounds(self, exists: np.ndarray) -> np.ndarray:
         """Return a mask (move, row, col) of the bounds in `exists` with routes for all robots.
@@ -207,9 +234,16 @@ class Posts:
         return self.routes.find(self.team.lead, self.stop(a), self.stop(c), self.window(a, c))
 
     def lead_line(self, a: Station, c: Station) -> np.ndarray:
-        """Return the lead's route in a bound, (point, 2), or a straight line if there is none."""
-        route = self._lead_route(a, c)
-        return np.stack([self.stop(a), self.stop(c)]) if route is None else route
+        """Return the lead's route in a bound, (point, 2), or a straight line if there is none.
+
+        The array is kept; do not change it.
+        """
+        ends = a[:2], c[:2]
+        if ends not in self._lines:
+            route = self._lead_route(a, c)
+            straight = np.stack([self.stop(a), self.stop(c)])
+            self._lines[ends] = straight if route is None else route
+        return self._lines[ends]
 
     # --- stops of the lead ---
 
@@ -228,7 +262,8 @@ class Posts:
         here = self._central[cell]
         around = [self._central[c] for c in self._around(cell)]
         goals = np.array([goal for goal in around if self._is_in_region(goal)])
-        lattice = self._lattice(cell, here, _STOP_RADIUS)
+        safe = self._linked_to(here, cell, over=self._safe)
+        lattice = self._lattice(here, _STOP_RADIUS, *safe)
         row, col = self.surface.nearest(*lattice.T)
         inside = (self._cells[0][row] == cell[0]) & (self._cells[1][col] == cell[1])
         position = np.concatenate([here[None], lattice[inside]])
@@ -272,62 +307,78 @@ class Posts:
         key = cell, next_cell, name
 
         if key not in self._posts:  # all next cells take little longer
-            around = [c for c in self._around(cell) if self._is_in_region(self.stop(c))]
-            ahead = list(dict.fromkeys([None, *around, next_cell]))
-            for c, posts in zip(ahead, self._choose_posts(cell, ahead, SETS[name]), strict=True):
+            view = self._view(cell, next_cell)
+            for c, posts in zip(
+                view.ahead, self._choose_posts(cell, view, SETS[name]), strict=True
+            ):
                 self._posts[cell, c, name] = posts
         posts = self._posts[key]
         return posts if self._members is None else posts[self._members]
 
-    def _choose_posts(self, cell: Cell, ahead: Sequence[Cell | None], aim: PostSet) -> np.ndarray:
+    def _view(self, cell: Cell, next_cell: Cell | None) -> "_View":
+        """Return what the choice of all sets of posts in a cell needs."""
+        view = self._views.get(cell)
+        if view is not None and next_cell in view.ahead:
+            return view
+
+        around = [c for c in self._around(cell) if self._is_in_region(self.stop(c))]
+        ahead = list(dict.fromkeys([None, *around, next_cell]))
+        here = self.stop(cell)
+        stops = np.array([here, *(here if c is None else self.stop(c) for c in ahead)])
+        routes = [np.stack([here] * 2) if c is None else self.lead_line(cell, c) for c in ahead]
+        first = np.cumsum([0, *map(len, routes)])
+        points = np.concatenate(routes)
+        aims, _ = at_times(self.surface, self.team.lead, points, first, _N_AIMS)
+
+        safe, corner = self._linked_to(here, cell, over=self._safe)
+        self._views[cell] = _View(ahead, stops, points, first, aims, safe, corner)
+        return self._views[cell]
+
+    def _choose_posts(self, cell: Cell, view: "_View", aim: PostSet) -> np.ndarray:
         """Choose the posts for each next cell, one robot at a time, (next cell, robot, 2)."""
         here = self.stop(cell)
         robots = self._whole.robots
 
-        position = self._lattice(cell, here, aim.radius)
+        position = self._lattice(here, aim.radius, view.safe, view.corner)
         gap = aim.gap
         if len(position) < len(robots):  # too little safe ground
             position = self._pixels_near(cell, here)
             gap = SPACING
 
-        scores = self._scores(cell, ahead, position, aim)
+        scores = self._scores(here, view, position, aim)
 
-        posts = np.empty((len(ahead), len(robots), 2))
+        posts = np.empty((len(view.ahead), len(robots), 2))
+        nearest = np.full((len(view.ahead), len(position)), np.inf)  # distance to a post
         for i, robot in enumerate(robots):
             score = scores[robot]
             if i:
-                nearest = np.stack([cdist(position, taken).min(1) for taken in posts[:, :i]])
+                np.minimum(nearest, cdist(posts[:, i - 1], position), out=nearest)
                 is_taken = nearest == 0.0  # avoided even where all positions are too close
                 score = score - _TOO_CLOSE * (nearest < gap) - _TOO_CLOSE * is_taken
             posts[:, i] = position[np.argmax(score, axis=1)]
 
-        for of_next, c in zip(posts, ahead, strict=True):
+        for of_next, c in zip(posts, view.ahead, strict=True):
             self._abreast(of_next, np.array([0.0, 1.0]) if c is None else self.stop(c) - here)
         return posts
 
     def _scores(
-        self, cell: Cell, ahead: Sequence[Cell | None], position: np.ndarray, aim: PostSet
+        self, here: np.ndarray, view: "_View", position: np.ndarray, aim: PostSet
     ) -> dict[Robot, np.ndarray]:
         """Score positions as posts of each robot, (next cell, position); see the formula above."""
-        here = self.stop(cell)
         lead = self.team.lead
-        stops = np.array([here, *(here if c is None else self.stop(c) for c in ahead)])
-        routes = [np.stack([here] * 2) if c is None else self.lead_line(cell, c) for c in ahead]
-        first = np.cumsum([0, *map(len, routes)])
-        aims, _ = at_times(self.surface, lead, np.concatenate(routes), first, _N_AIMS)
-
         nearer = aim.nearer * np.linalg.norm(position - here, axis=1)
-        blocking = np.array([cdist(position, route).min(1) < SPACING for route in routes])
+        from_route = np.minimum.reduceat(cdist(view.points, position), view.first[:-1])
+        blocking = from_route < SPACING
 
         scores = {}
         for robot in dict.fromkeys(self._whole.robots):
-            closing = self._seen(stops[:, None], position, lead, robot)
+            closing = self._seen(view.stops[:, None], position, lead, robot)
             closing *= (1.0 - aim.watching) / 2.0
             seen = closing[0] + closing[1:]
 
             best = np.argsort(nearer - seen, axis=1, kind="stable")[:, :_N_WATCHED]
             eyes = position[best][:, :, None] + jittered(_N_AIMS)
-            watched = aim.watching * self._seen(eyes, aims[:, None], robot, lead).mean(-1)
+            watched = aim.watching * self._seen(eyes, view.aims[:, None], robot, lead).mean(-1)
 
             score = seen - 1.0  # for positions whose sight of the route is not computed
             np.put_along_axis(score, best, np.take_along_axis(seen, best, 1) + watched, 1)
@@ -383,23 +434,23 @@ class Posts:
         pixel = self.surface.nearest(*position)
         return linked_to(ground, window, pixel), (window[0], window[2])
 
-    def _lattice(self, cell: Cell, here: np.ndarray, radius: float) -> np.ndarray:
-        """Return lattice positions (position, 2) around `here`, connected to `here` by safe ground.
+    def _lattice(
+        self, here: np.ndarray, radius: float, linked: np.ndarray, corner: tuple[int, int]
+    ) -> np.ndarray:
+        """Return lattice positions (position, 2) around `here`, in a mask of pixels.
 
-        The connection stays within half a cell of the cell, and thus in the window of each bound.
+        The mask is that of `_linked_to`, which stays within half a cell of the cell, and thus in
+        the window of each bound.
         """
-        steps = np.arange(-radius, radius + 1e-9, _STEP)
-        offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-        distance = np.linalg.norm(offset, axis=1)
-        offset = offset[(distance <= radius) & (distance >= SPACING)]
-
+        n_cols = linked.shape[1]
+        offset = _lattice_offsets(radius)
         pixels = np.rint(np.stack(self.surface.to_pixel(*(here + offset).T), axis=1)).astype(int)
-        linked, corner = self._linked_to(here, cell, over=self._safe)
-        inside = ((pixels >= corner) & (pixels < np.add(corner, linked.shape))).all(1)
+        row, col = (pixels - corner).T
+        inside = (row >= 0) & (row < linked.shape[0]) & (col >= 0) & (col < n_cols)
 
-        row, col = np.unique(pixels[inside], axis=0).T
-        kept = linked[row - corner[0], col - corner[1]]
-        return self.surface.centers(row[kept], col[kept])
+        row, col = np.divmod(np.unique(row[inside] * n_cols + col[inside]), n_cols)
+        kept = linked[row, col]
+        return self.surface.centers(row[kept] + corner[0], col[kept] + corner[1])
 
     def _pixels_near(self, cell: Cell, here: np.ndarray) -> np.ndarray:
         """Return positions in a cell, connected to the stop `here` and near it if possible."""
