@@ -222,8 +222,8 @@ def faults(planner, params, world, best):
         return ["refused"] if best > -np.inf else [], error.path is not None
     scale = max(1.0, abs(best))
     shape = planner.workspace.grid.shape
-    posts = [*posts_along(plan.path), 0]
-    cells = (int(np.ravel_multi_index(cell[:2], shape)) for cell in plan.path)
+    posts = [*posts_along(plan.stations), 0]
+    cells = (int(np.ravel_multi_index(cell, shape)) for cell in plan.path)
     flat = [*zip(cells, posts, strict=True)]
     score, wrong = score_along(world, flat), []
     if plan.exact and score < best - 1e-9 * scale:

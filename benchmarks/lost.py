@@ -122,7 +122,10 @@ def rows_of(
         campaign = campaign_of(world, course, method, n_missions)
         labels = {"world": world.name, "kind": world.kind, "course": course, "method": method}
         arrived = np.mean([mission.status == "ok" for mission in campaign.missions])
-        paths = [*(entry.plan.path for entry in campaign.state.entries), campaign.plan().path]
+        paths = [
+            *(entry.plan.stations for entry in campaign.state.entries),
+            campaign.plan().stations,
+        ]
         changes = [k for k in range(1, len(paths)) if paths[k] != paths[k - 1]]
         lost = {lost_after(k): lost_in(mission) for k, mission in enumerate(campaign.missions)}
         rows.append(labels | {"settled": max(changes, default=0), "arrive": arrived} | lost)

@@ -120,7 +120,7 @@ def rates_of(mission: Mission) -> list[tuple[tuple[int, int, int], float]]:
 
     A bound that failed kept no contact.
     """
-    bounds = bounds_along(mission.path).tolist()
+    bounds = bounds_along(mission.stations).tolist()
     rates = []
     for where, bound in zip(bounds, mission.bounds, strict=False):
         measured = np.isfinite(bound.contact_rate)

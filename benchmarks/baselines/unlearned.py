@@ -17,7 +17,7 @@ class RandomPath(PathPolicy):
 
     def recommend(self, campaign: Campaign) -> Path:
         """Path of the next mission."""
-        return campaign.ask().path
+        return campaign.ask().stations
 
     def choose(self, planner: Planner, rng: np.random.Generator) -> Path:
         """Draw a path, at no cost of failures."""

@@ -137,9 +137,8 @@ class Mission(Summary):
     driven a bound back to the previous cell.
 
     Attributes:
-        path: Planned cells, start first, each (row, col), or (row, col, name) if T2 watched the
-            lead's move out of the cell from another set of posts than the standard one (see
-            `Workspace.from_terrain`); empty in a log without a map.
+        path: Planned cells (row, col), start first; empty in a log without a map. If stations are
+            given, as in `stations`, they are split into cells and `post_sets`.
         awareness: Situational awareness, shape (bound, robot, feature), in [0, 1], or any finite
             values in a log without a map; NaN where not measured.
         contact_rate: Fraction of time in contact, shape (bound, robot); NaN where not measured.
@@ -158,6 +157,8 @@ class Mission(Summary):
         poses: Poses of the team at the ticks of each bound, as in `Bound`; None where not recorded.
         contact: Contact at the ticks of each bound, as in `Bound`; None where not recorded.
         sightings: Places at which robots saw a threat; see `planning.threat_map`.
+        post_sets: Name of the set of posts from which T2 watched each bound of `path` (see
+            `Workspace.from_terrain`); empty if all are standard.
 
     Raises:
         TrustboError: The bounds do not fit the path, the arrays disagree on the number of bounds,
@@ -174,7 +175,7 @@ class Mission(Summary):
         (0, 1)
     """
 
-    path: tuple[Station, ...]
+    path: tuple[Cell, ...]
     awareness: np.ndarray
     contact_rate: np.ndarray
     duration: np.ndarray
@@ -189,6 +190,7 @@ class Mission(Summary):
     poses: tuple[np.ndarray | None, ...] = ()
     contact: tuple[np.ndarray | None, ...] = ()
     sightings: tuple[Sighting, ...] = ()
+    post_sets: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for status in (self.status, *self.bound_status):
@@ -196,8 +198,10 @@ class Mission(Summary):
         if not isinstance(self.scale, str) or self.scale:
             levels_of(self.scale)
 
+        path, post_sets = split_path(self.path, self.post_sets)
         kept: dict[str, Any] = {
-            "path": require_path("path", self.path),
+            "path": path,
+            "post_sets": post_sets,
             "bound_status": tuple(self.bound_status),
             "sightings": _require_sightings(self.sightings),
         }
@@ -267,9 +271,7 @@ class Mission(Summary):
                 f"run, and the last one has the status {last!r}; give the status of the mission."
             )
 
-        if (
-            min((min(cell[:2]) for cell in self.path), default=0) < 0
-        ):  # would be read from the other end
+        if min(map(min, self.path), default=0) < 0:  # would be read from the other end
             raise TrustboError(
                 f"rows and columns are counted from 0, but the path is {self.path}; give path=None "
                 "for a log without a map."
@@ -278,7 +280,7 @@ class Mission(Summary):
     def _name_of(self, k: int) -> str:
         """Return what messages call bound k, counted from 0."""
         mapped = len(self.path) > k + 1
-        return f"the bound into cell {self.path[k + 1][:2]}" if mapped else f"bound {k + 1}"
+        return f"the bound into cell {self.path[k + 1]}" if mapped else f"bound {k + 1}"
 
     def _rows(self) -> Rows:
         rates = self.contact_rate
@@ -308,6 +310,7 @@ class Mission(Summary):
         n_ticks: ArrayLike | None = None,
         features: Sequence[str] = (),
         robots: Sequence[str] = (),
+        post_sets: Sequence[str] = (),
     ) -> Self:
         """Make a mission from the arrays of a log.
 
@@ -333,6 +336,8 @@ class Mission(Summary):
             features: Names of the features; by default those of the labels, or traversability,
                 visibility, z3, ... (a workspace with the same number of features renames z3, ...).
             robots: Names of the robots; by default those of the labels, or r1, r2, ...
+            post_sets: Name of the set of posts for each bound of the path; by default, all are
+                standard.
 
         Raises:
             TrustboError: The axes or labels do not fit together, a value is outside [0, 1], or the
@@ -377,6 +382,7 @@ class Mission(Summary):
             status=statuses[-1],
             features=names["feature"],
             robots=names["robot"],
+            post_sets=tuple(post_sets),
         )
 
     def with_awareness(self, awareness: np.ndarray) -> Self:
@@ -472,7 +478,16 @@ class Mission(Summary):
 
     def has_same_data(self, other: "Mission") -> bool:
         """Return whether another mission has the same path, outcome and measurements."""
-        about = ("path", "status", "bound_status", "features", "robots", "scale", "map")
+        about = (
+            "path",
+            "post_sets",
+            "status",
+            "bound_status",
+            "features",
+            "robots",
+            "scale",
+            "map",
+        )
         if any(getattr(self, name) != getattr(other, name) for name in about):
             return False
         return all(
@@ -485,15 +500,29 @@ class Mission(Summary):
         """Status of each bound; that of the last bound is the status of the mission."""
         return [*self.bound_status[:-1], self.status]
 
+    @cached_property
+    def stations(self) -> tuple[Station, ...]:
+        """Path as cells (row, col), or (row, col, name) if a bound has another set than standard.
+
+        The name belongs to the lead's move out of the cell. Functions that take a path also take
+        stations.
+        """
+        return stations_of(self.path, self.post_sets)
+
     @property
-    def driven(self) -> tuple[Station, ...]:
+    def driven(self) -> tuple[Cell, ...]:
         """Cells of the path that were entered, start first; empty in a log without a map."""
         return self.path[: len(self.contact_rate) + 1]
+
+    @property
+    def driven_stations(self) -> tuple[Station, ...]:
+        """Stations of the path that were entered; see `driven`."""
+        return self.stations[: len(self.contact_rate) + 1]
 
     @cached_property
     def bounds(self) -> tuple[Bound, ...]:
         """Bounds that were run, whose arrays are views of those of the mission."""
-        cells = cells_of(self.driven[1:]) or [NOWHERE] * len(self.contact_rate)
+        cells = self.driven[1:] or (NOWHERE,) * len(self.contact_rate)
         columns = (getattr(self, name) for name in OF_BOUNDS)
 
         return tuple(Bound(*values) for values in zip(cells, *columns, strict=True))
@@ -545,14 +574,50 @@ def require_path(what: str, value: object) -> tuple[Station, ...]:
     return require_cells(what, value, POST_SETS)
 
 
+def split_path(
+    path: object, post_sets: Sequence[str] = ()
+) -> tuple[tuple[Cell, ...], tuple[str, ...]]:
+    """Return the cells of a path, and the name of the set of posts of each of its bounds.
+
+    The names are those of stations in the path or, if it has none, `post_sets`. The result has no
+    names if all sets are standard.
+
+    Raises:
+        TrustboError: A cell or a name is invalid, or the number of names is not that of bounds.
+    """
+    stations = require_path("path", path)
+    cells = tuple(cells_of(stations))
+    names = tuple(station[2] if len(station) > 2 else POST_SETS[0] for station in stations[:-1])
+    if post_sets and stations == cells:
+        remedy = "give one name for each bound of the path"
+        names = tuple(require_list("post_sets", post_sets, str, remedy))
+        for k, name in enumerate(names):
+            require_choice(f"post_sets[{k}]", name, POST_SETS)
+        n_bounds = max(0, len(cells) - 1)
+        if len(names) != n_bounds:
+            raise TrustboError(
+                f"post_sets must be {n_bounds} names, one for each bound of the path; got "
+                f"{len(names)}."
+            )
+    return cells, names if any(name != POST_SETS[0] for name in names) else ()
+
+
+def stations_of(cells: Sequence[Cell], post_sets: Sequence[str]) -> tuple[Station, ...]:
+    """Return the stations of a path of cells and of the names of its sets of posts."""
+    if not post_sets:
+        return tuple(cells)
+    of_moves = zip(cells, post_sets, strict=False)  # no move leads out of the last cell
+    return require_path("path", [*((*cell, name) for cell, name in of_moves), cells[-1]])
+
+
 def cells_of(path: Iterable[Station]) -> list[Cell]:
     """Return the cells of a path, (row, col), without the sets of posts."""
     return [station[:2] for station in path]
 
 
 def path_text(path: Iterable[Station]) -> str:
-    """Write cells as on the command line: "9,0 8,1", or "9,0,far 8,1" with a set of posts."""
-    return " ".join(",".join(map(str, cell)) for cell in path)
+    """Write cells as on the command line: "9,0 8,1"; sets of posts in stations are left out."""
+    return " ".join(",".join(map(str, station[:2])) for station in path)
 
 
 def is_predicted(feature: str) -> bool:

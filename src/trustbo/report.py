@@ -153,9 +153,9 @@ def bounds_of(result: Result) -> pd.DataFrame:
     own = [entry.mission for entry in state.entries if entry.exclusion is None]
     rates = defaultdict(list)  # by the cells left and entered
     for mission in [*earlier, *own]:
-        for (a, c), rate in zip(pairwise(mission.path), mission.contact_rate, strict=False):
+        for (a, c), rate in zip(pairwise(mission.stations), mission.contact_rate, strict=False):
             rates[a, c[:2]].append(pd.Series(rate).mean())  # of the measured robots
-    of_path = [pd.Series(rates[a, c[:2]], dtype=float) for a, c in pairwise(plan.path)]
+    of_path = [pd.Series(rates[a, c[:2]], dtype=float) for a, c in pairwise(plan.stations)]
 
     table = plan.to_frame()
     table["contact"] = [np.nan, *contact.mean(1)]

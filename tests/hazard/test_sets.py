@@ -198,8 +198,8 @@ def test_a_plan_takes_the_sets_that_arrive_and_its_graph_has_their_risks():
     planner = tb.Planner(cells(), (3, 0), (0, 3), max_failure=0.0).with_risk(p)
     plan = planner.plan(PARAMS)
     assert plan.exact
-    assert {cell[2] for cell in plan.path[:-2]} == {"far"}
-    assert plan.path[-2][2] in ("far", "route")  # the bound that ends the path
+    assert {cell[2] for cell in plan.stations[:-2]} == {"far"}
+    assert plan.stations[-2][2] in ("far", "route")  # the bound that ends the path
     assert plan.p_arrive == 1.0
 
     graph = planner.graph(PARAMS)

@@ -520,7 +520,7 @@ def test_a_planned_path_with_sets_of_posts_is_that_of_the_mission(field):
     poses, seen = driven(field, PLANNED)
     path = ((3, 0, "far"), (2, 1), (1, 2, "route"), (0, 3))
     one = read_driven(field, poses, seen, path=path)
-    assert (one.path, one.status) == (path, "ok")
+    assert (one.stations, one.status) == (path, "ok")
     plain = read_driven(field, poses, seen)
     np.testing.assert_array_equal(one.contact_rate, plain.contact_rate)
     with pytest.raises(TrustboError, match="path"):

@@ -217,7 +217,7 @@ def test_the_limit_holds_for_bounds_that_fail_together(workspace, objective):
             refused += 1
             with pytest.raises(InfeasibleError) as error:
                 planner.plan(PARAMS)
-            assert error.value.path == paths[failure.argmin()]
+            assert error.value.stations == paths[failure.argmin()]
             assert error.value.p_fail == pytest.approx(failure.min(), rel=1e-9)
             continue
 

@@ -105,7 +105,11 @@ def test_ways_are_moves_with_a_set_of_posts():
 def test_a_mission_measures_the_awareness_of_its_posts(workspace):
     simulator = KinematicSimulator(workspace)
     mission = simulator.run(ROUTE, seed=3)
-    assert mission.path == ROUTE
+    assert mission.stations == ROUTE
+    assert mission.path == ((2, 0), (1, 1), (1, 2), (0, 2))
+    assert mission.post_sets == ("far", "standard", "route")
+    named = simulator.run(mission.path, seed=3, post_sets=mission.post_sets)
+    assert named.has_same_data(mission)
     assert [bound.cell for bound in mission.bounds] == [(1, 1), (1, 2), (0, 2)]
     of_path = workspace.awareness.values[:, [10, 4, 17], [1, 1, 0], [1, 2, 2]]
     of_path[:, :2, -1] += workspace.onward.values[:, [10, 4], [1, 1], [1, 2], [4, 17]]
@@ -115,21 +119,22 @@ def test_a_mission_measures_the_awareness_of_its_posts(workspace):
     first = mission.bounds[0].poses[0, 1:, :2]
     off = np.linalg.norm(first - workspace.posts.watching((2, 0, "far"), (1, 1)), axis=1)
     assert off.max() < 3.0
-    plain = simulator.run([cell[:2] for cell in ROUTE], seed=3)
+    plain = simulator.run(mission.path, seed=3)
+    assert plain.post_sets == ()
     assert not np.array_equal(plain.bounds[0].poses[0], mission.bounds[0].poses[0])
 
 
 def test_a_campaign_chooses_sets_and_its_files_keep_them(workspace, result, tmp_path):
     plan = result.plan()
-    chosen = {cell[2:] for mission in result.missions for cell in mission.path}
-    assert len(chosen) > 1
+    assert all(len(cell) == 2 for one in (plan, *result.missions) for cell in one.path)
+    assert len({name for mission in result.missions for name in mission.post_sets}) > 1
     assert (result.table()["state"] == "learned").all()
-    np.testing.assert_array_equal(plan.posts[0], workspace.posts.watching(*plan.path[:2]))
+    np.testing.assert_array_equal(plan.posts[0], workspace.posts.watching(*plan.stations[:2]))
     assert plan.to_frame()["posts"].isin([*POST_SETS, ""]).all()
     assert result.history["posts"].values.max() > 0
 
     read = tb.logs.read_table(tb.logs.to_frame(result.missions))
-    assert [mission.path for mission in read] == [mission.path for mission in result.missions]
+    assert [one.stations for one in read] == [one.stations for one in result.missions]
     tb.logs.write_missions(tmp_path / "log.nc", result.missions)
     stored = tb.logs.read_missions(tmp_path / "log.nc")
     assert all(a.has_same_data(b) for a, b in zip(stored, result.missions, strict=True))
@@ -139,7 +144,7 @@ def test_a_campaign_chooses_sets_and_its_files_keep_them(workspace, result, tmp_
     names = [f["properties"]["posts"] for f in features if "robot" in f["properties"]
              and "posts" in f["properties"]]  # fmt: skip
     assert len(names) == 3 * (len(plan.path) - 1)
-    assert set(names) == {(*cell, POST_SETS[0])[2] for cell in plan.path[:-1]}
+    assert set(names) == {(*cell, POST_SETS[0])[2] for cell in plan.stations[:-1]}
 
 
 def test_a_stored_campaign_with_sets_resumes_as_if_it_had_not_stopped(workspace, result, tmp_path):
@@ -149,9 +154,53 @@ def test_a_stored_campaign_with_sets_resumes_as_if_it_had_not_stopped(workspace,
     again = tb.resume(folder, n_iterations=3, simulator=simulator)
     assert again.workspace.n_posts == 3
     assert again.workspace.onward.identical(workspace.onward)
-    paths = [mission.path for mission in result.missions]
-    assert [mission.path for mission in again.missions] == paths
-    assert again.plan().path == result.plan().path
+    paths = [mission.stations for mission in result.missions]
+    assert [mission.stations for mission in again.missions] == paths
+    assert again.plan().stations == result.plan().stations
+
+
+class Cells:
+    """Simulator that knows cells only, as a user's may."""
+
+    def __init__(self, workspace):
+        self.inner = KinematicSimulator(workspace)
+
+    def run(self, path, *, seed, mission=0):
+        cells = [(row, col) for row, col in path]
+        return self.inner.run(cells, seed=seed, mission=mission)
+
+
+class Sets(Cells):
+    """Simulator that also reads the sets of posts."""
+
+    def run(self, path, *, seed, mission=0, post_sets=()):
+        self.asked = post_sets
+        return self.inner.run(path, seed=seed, mission=mission, post_sets=post_sets)
+
+
+def test_a_simulator_gets_sets_if_it_reads_them_and_otherwise_cells(workspace, result):
+    options = {"n_iterations": 1, "seed": 1}
+    cells, sets = Cells(workspace), Sets(workspace)
+    plain = tb.iterate(workspace, *ENDS, simulator=cells, **options)
+    [mission] = plain.missions
+    assert mission.post_sets == ()  # the standard posts, whatever was planned
+    assert plain.table()["posts"].tolist() == [" ".join(result.missions[0].post_sets)]
+
+    named = tb.iterate(workspace, *ENDS, simulator=sets, **options)
+    assert sets.asked == named.missions[0].post_sets == result.missions[0].post_sets != ()
+
+
+def test_names_of_sets_are_one_for_each_bound():
+    z, rates = np.full((2, 3, 2), np.nan), np.full((2, 3), 0.5)
+    path = [(2, 0), (1, 0), (0, 1)]
+    mission = tb.Mission.from_arrays(path, z, rates, post_sets=("standard", "far"))
+    assert mission.stations == ((2, 0), (1, 0, "far"), (0, 1))
+    assert tb.Mission.from_arrays(mission.stations, z, rates).has_same_data(mission)
+    assert tb.Mission.from_arrays(path, z, rates, post_sets=["standard"] * 2).post_sets == ()
+    with pytest.raises(tb.TrustboError, match="post_sets must be 2 names, one for each bound"):
+        tb.Mission.from_arrays(path, z, rates, post_sets=["far"])
+    with pytest.raises(tb.TrustboError, match=r"unknown post_sets\[1\] 'near'"):
+        tb.Mission.from_arrays(path, z, rates, post_sets=["far", "near"])
 
 
 def test_a_mission_whose_first_bound_has_other_posts_is_learned(workspace):
@@ -164,17 +213,18 @@ def test_a_mission_whose_first_bound_has_other_posts_is_learned(workspace):
 def test_a_path_gets_the_sets_at_whose_posts_the_robots_stood(workspace):
     mission = KinematicSimulator(workspace).run(ROUTE, seed=3)
     stood = np.stack([bound.poses[0, 1:, :2] for bound in mission.bounds])
-    cells = [cell[:2] for cell in ROUTE]
-    assert workspace.with_posts(cells, stood) == ROUTE
-    assert workspace.with_posts(cells, np.full(stood.shape, np.nan)) == tuple(cells)
+    cells = mission.path
+    assert workspace.post_sets_of(cells, stood) == mission.post_sets
+    unknown = np.full(stood.shape, np.nan)
+    assert workspace.post_sets_of(cells, unknown) == ("standard", "standard", "standard")
 
     stood[1] += 100.0
     with pytest.raises(tb.TrustboError, match=r"stood 1[0-9]{2} m from its post .* cell \(1, 1\)"):
-        workspace.with_posts(cells, stood)
+        workspace.post_sets_of(cells, stood)
     with pytest.raises(tb.TrustboError, match=r"\(bound, robot, 2\) = \(3, 3, 2\); got"):
-        workspace.with_posts(cells, stood[0])
+        workspace.post_sets_of(cells, stood[0])
     with pytest.raises(tb.TrustboError, match="made from a terrain"):
-        tb.Workspace.from_awareness(np.ones((3, 3, 3, 1))).with_posts(cells, stood)
+        tb.Workspace.from_awareness(np.ones((3, 3, 3, 1))).post_sets_of(cells, stood)
 
 
 def test_trust_is_that_of_the_posts_asked_for(workspace, result):
@@ -189,12 +239,13 @@ def test_a_team_that_follows_a_plan_and_turns_off_has_the_standard_posts(workspa
     campaign = tb.Campaign(workspace, *ENDS)
     plan = campaign.ask()
     follower = tb.Follower(campaign)
-    follower.begin(t=0.0, cell=plan.path[1][:2])
+    follower.begin(t=0.0, cell=plan.path[1])
     assert follower.path == plan.path  # the planned cell, with the planned posts
     follower.tick(1.0, [True, True, False])
     follower.end(t=10.0, status="stuck")
-    rest = follower.replan(blocked=[(plan.path[0][:2], plan.path[1][:2])])
-    assert rest.path[0][:2] == plan.path[0][:2]
+    assert follower.to_mission().post_sets == plan.post_sets
+    rest = follower.replan(blocked=[plan.path[:2]])
+    assert rest.start == plan.start
 
 
 @pytest.mark.parametrize(
@@ -232,7 +283,8 @@ def test_no_other_set_of_a_bound_makes_the_plan_better(workspace, result):
         table.query("chosen")["value"].droplevel(1), best, rtol=0, atol=1e-12
     )
 
-    other = [(*result.plan().path[0][:2], "far"), *result.plan().path[1:]]
+    stations = result.plan().stations
+    other = [(*stations[0][:2], "far"), *stations[1:]]
     expected = result.planner.evaluate(other, result.belief.mean())
     assert table.loc[(1, "far"), "value"] == pytest.approx(expected.value)
     assert table.loc[(1, "far"), "trust"] == pytest.approx(expected.trust[0].mean())

@@ -255,7 +255,7 @@ class Campaign(Recorder):
         """Add posterior bands and past failures to a plan."""
         planner = self.planner_of(Course.of(plan))
         plan = with_past_failures(plan, self.state, planner)
-        return plan.with_draws(planner.evaluate(plan.path, self.forecast))
+        return plan.with_draws(planner.evaluate(plan.stations, self.forecast))
 
     def _evaluated(self, path: Sequence[Cell], course: Course) -> Plan:
         """Plan a given path of a course."""
@@ -446,7 +446,7 @@ class Campaign(Recorder):
         asked for, it is planned here, which may be slow. A mission on another course has the plan
         of its own path.
         """
-        start, last = (mission.path[k][:2] for k in (0, -1))
+        start, last = (mission.path[k] for k in (0, -1))
         asked = self.state.asked
         ends = self._own_ends if asked is None else (asked.start, asked.goal)
         if ends is not None and start == ends[0] and (mission.status != "ok" or last == ends[1]):
@@ -458,7 +458,7 @@ class Campaign(Recorder):
         self.storage.require_open()
         self._learn()
         try:
-            plan = self._evaluated(mission.path, course)
+            plan = self._evaluated(mission.stations, course)
         except NoPathError:
             raise
         except TrustboError:  # the map says that a bound of the path cannot be driven
@@ -507,7 +507,7 @@ class Campaign(Recorder):
                     "before the mission is run; a mission that was told with this status already "
                     "counts as a failure."
                 )
-            path = self.ask().path if reason in CAUSES or where is not None else ()
+            path = self.ask().stations if reason in CAUSES or where is not None else ()
             where = None if where is None else require_pair("where", where)
             entered = tuple(cells_of(path[1:]))
             if where is not None and (reason not in CAUSES or where not in entered):

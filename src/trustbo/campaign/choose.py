@@ -78,7 +78,7 @@ def instead_of_failure(planner: Planner, plan: Plan, draws: Draws) -> Plan:
     problem = planner.problem
     if problem.risk is None or not problem.cost_of_failure:
         return plan
-    if problem.risk.failure(plan.path) <= _HOPELESS:
+    if problem.risk.failure(plan.stations) <= _HOPELESS:
         return plan
 
     path, _ = problem.safest()
@@ -112,17 +112,17 @@ def choose(
     try:
         plan = choose_plan(policy, rng, draws, planner, driven)
     except InfeasibleError as error:  # `warn_if_infeasible` issues the warning
-        return planner.evaluate(error.path, draws.mean())
+        return planner.evaluate(error.stations, draws.mean())
 
     name = f"policy {name!r}"
     require_kind(name, plan, Plan, "a policy must return a trustbo.planning.Plan")
     try:
-        planner.require_path(plan.path)
+        planner.require_path(plan.stations)
     except TrustboError as error:
         raise TrustboError(f"{name}: {error}") from None
 
     safest = instead_of_failure(planner, plan, draws)
-    if safest.path != plan.path:
+    if safest.stations != plan.stations:
         warn(
             f"the path {path_text(plan.path)} almost certainly fails; the safest path is "
             f"planned instead, which arrives with probability {safest.p_arrive:.2g}."

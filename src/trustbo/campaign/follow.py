@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.replan import trust_filter
-from trustbo.data import MEASURED, STATUSES, Bound, Cell, Mission, Station, path_text
+from trustbo.data import MEASURED, STATUSES, Bound, Cell, Mission, Station, cells_of, path_text
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
     TrustboError,
@@ -33,7 +33,6 @@ class Follower(Summary):
     Awareness is taken from the map.
 
     Attributes:
-        path: Cells of the mission in order: the cells entered, followed by the planned ones.
         bounds: Bounds that have ended.
         trust: Current trust, shapes (robot,); during a bound, the trust if the bound ended now.
         running: Whether a bound is in progress.
@@ -55,10 +54,10 @@ class Follower(Summary):
         """
         require_kind("campaign", campaign, Campaign, "give a trustbo.Campaign")
         plan = campaign.ask()
-        self.path: tuple[Station, ...] = tuple(plan.path)
+        self._stations = plan.stations
         self._campaign = campaign
         self._workspace = plan.workspace
-        self._goal = self.path[-1]
+        self._goal = plan.goal
         self.bounds: tuple[Bound, ...] = ()
         self.running = False
 
@@ -71,6 +70,11 @@ class Follower(Summary):
         self._started = self._begun = self._last = -np.inf  # times of start and last call
         n_robots = self._workspace.team.n_robots
         self._counts = np.zeros((2, n_robots))  # ticks with contact; all ticks
+
+    @property
+    def path(self) -> tuple[Cell, ...]:
+        """Cells of the mission in order: the cells entered, followed by the planned ones."""
+        return tuple(cells_of(self._stations))
 
     def _rows(self) -> Rows:
         here, *planned = self.rest
@@ -86,10 +90,15 @@ class Follower(Summary):
         ]
 
     @property
-    def rest(self) -> tuple[Station, ...]:
+    def rest(self) -> tuple[Cell, ...]:
         """Cell that the lead is in or is entering, followed by the planned cells."""
+        return tuple(cells_of(self._ahead))
+
+    @property
+    def _ahead(self) -> tuple[Station, ...]:
+        """Stations of `rest`."""
         n_entered = len(self.bounds) + 1 if self.running else len(self.bounds)
-        return self.path[n_entered:]
+        return self._stations[n_entered:]
 
     def begin(self, t: float, cell: Cell | None = None) -> None:
         """Begin the next bound at time `t`, into the planned cell or into a neighbouring `cell`.
@@ -107,9 +116,9 @@ class Follower(Summary):
                 "goes on."
             )
 
-        here, *planned = self.rest
+        here, *planned = self._ahead
         if cell is None and not planned:
-            raise TrustboError(f"no cell is planned after {here}; pass the next cell to begin.")
+            raise TrustboError(f"no cell is planned after {here[:2]}; pass the next cell to begin.")
         if cell is None:
             cell = planned[0]
         else:  # the planned cell has the planned posts
@@ -118,7 +127,7 @@ class Follower(Summary):
 
         self._count(t, np.zeros_like(self._counts), (here, cell))
         if planned[:1] != [cell]:
-            self.path = (*self.path[: len(self.bounds) + 1], cell)
+            self._stations = (*self._stations[: len(self.bounds) + 1], cell)
 
         self._started = self._started if self.bounds else t
         self._begun = t
@@ -146,7 +155,7 @@ class Follower(Summary):
             raise TrustboError(f"in_contact must be 0, 1 or NaN for each robot; got {seen}.")
 
         counts = self._counts + np.stack([np.nan_to_num(seen), measured])
-        here, cell = self.path[len(self.bounds) :][:2]
+        here, cell = self._stations[len(self.bounds) :][:2]
         self._count(t, counts, (here, cell))
 
     def end(self, t: float, status: str = "ok") -> None:
@@ -165,7 +174,7 @@ class Follower(Summary):
         since = self._begun - self._started
 
         rates, n_ticks = self._measured
-        bound = Bound(self.rest[0][:2], unknown, rates, seconds, n_ticks, status, since)
+        bound = Bound(self.rest[0], unknown, rates, seconds, n_ticks, status, since)
         self.bounds = (*self.bounds, bound)
         self.running = False
         self._is_over = status != "ok"
@@ -196,11 +205,11 @@ class Follower(Summary):
         self._require(running=False)
         n = len(self.bounds)
         if cell is None:
-            cell = self.path[n - 1 if self._is_over else n][:2]
+            cell = self.path[n - 1 if self._is_over else n]
 
         so_far = self.to_mission() if n else None
         plan = self._campaign.replan(cell, so_far, blocked=blocked)
-        self.path = tuple(plan.path)
+        self._stations = plan.stations
         self._is_over = False
         return plan
 
@@ -215,7 +224,7 @@ class Follower(Summary):
         here, *planned = self.rest
         if not planned:
             raise TrustboError(f"no cell is planned after {here}; nothing is left to predict.")
-        return self._now.predict(self._workspace.along(self.rest, anywhere=True), self.rest)
+        return self._now.predict(self._workspace.along(self._ahead, anywhere=True), self._ahead)
 
     def to_mission(self) -> Mission:
         """Return the completed bounds as a mission, whose awareness is NaN (not measured).
@@ -235,7 +244,7 @@ class Follower(Summary):
         if status == "ok" and self.rest != (self._goal,):
             status = "aborted"
         return Mission(
-            self.path,
+            self._stations,
             *(np.stack([getattr(bound, name) for bound in self.bounds]) for name in MEASURED),
             bound_status=tuple(bound.status for bound in self.bounds),
             starts=tuple(bound.t0 for bound in self.bounds),

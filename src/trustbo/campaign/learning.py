@@ -46,7 +46,7 @@ def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Missio
         TrustboError: The path leaves the grid or skips cells.
     """
     try:
-        of_team = workspace.along(mission.path, anywhere=True)[: len(mission.bounds)]
+        of_team = workspace.along(mission.stations, anywhere=True)[: len(mission.bounds)]
     except TrustboError as error:
         if any(status != "ok" for status in mission.bound_status[:-1]):
             raise TrustboError(
@@ -249,15 +249,15 @@ def _parts(mission: Mission, planned: Planned) -> list[Mission]:
     for path in abandoned:
         cells = cells_of(path)
         failed = next((k for k in range(first, len(mission.statuses)) if _failed(mission, k)), None)
-        if failed is None or cells[: failed + 2] != cells_of(mission.path[: failed + 2]):
+        if failed is None or cells[: failed + 2] != [*mission.path[: failed + 2]]:
             continue
 
         part = _some_bounds(mission, first, failed + 1, mission.statuses[failed])
-        rest = (*mission.path[first : failed + 1], *path[failed + 1 :])
-        parts.append(replace(part, path=rest))
+        rest = (*mission.stations[first : failed + 1], *path[failed + 1 :])
+        parts.append(replace(part, path=rest, post_sets=()))
 
         first = failed + 1
-        is_back = cells_of(mission.path[first + 1 : first + 2]) == (cells[failed],)
+        is_back = mission.path[first + 1 : first + 2] == (cells[failed],)
         if is_back and not _failed(mission, first):
             first += 1
 
@@ -277,7 +277,7 @@ def _failed(mission: Mission, k: int) -> bool:
 def _some_bounds(mission: Mission, begin: int, end: int, status: str) -> Mission:
     """Return some bounds of a mission, with the cells that the mission has planned after them."""
     of_bounds = {name: getattr(mission, name)[begin:end] for name in OF_BOUNDS}
-    return replace(mission, path=mission.path[begin:], status=status, **of_bounds)
+    return replace(mission, path=mission.stations[begin:], post_sets=(), status=status, **of_bounds)
 
 
 def _with_planned_path(mission: Mission, path: Sequence[Station]) -> Mission:
@@ -287,7 +287,7 @@ def _with_planned_path(mission: Mission, path: Sequence[Station]) -> Mission:
     plan has for it, which are then known.
     """
     n = len(mission.path)
-    is_begun = all(a[:2] == b[:2] for a, b in zip(path, mission.path, strict=False))
+    is_begun = all(a[:2] == b for a, b in zip(path, mission.path, strict=False))
     if mission.status == "ok" or len(path) <= n or not is_begun:
         return mission
-    return replace(mission, path=(*mission.path[:-1], *path[n - 1 :]))
+    return replace(mission, path=(*mission.stations[:-1], *path[n - 1 :]), post_sets=())

@@ -12,7 +12,7 @@ import numpy as np
 
 from trustbo.campaign.learning import missions_of_hazard
 from trustbo.campaign.state import State
-from trustbo.data import POST_SETS, Cell, Mission, Station, cells_of, require_path
+from trustbo.data import POST_SETS, Cell, Mission, Station, require_path
 from trustbo.hazard.trials import CAUSES, UNKNOWN, Trials
 from trustbo.planning import Plan, Planner
 from trustbo.planning.plan import PastFailure
@@ -42,12 +42,12 @@ def with_past_failures(
     found = []
     for mission, status, (before, row, col, after) in _failures(state, planner, so_far):
         for k in ahead:
-            if plan.path[k][:2] != (row, col):
+            if plan.path[k] != (row, col):
                 continue
 
             stations = [_left(before, (row, col))]
             if after == UNKNOWN:
-                stations += [plan.path[k], *cells_of(plan.path[k + 1 : k + 2])]
+                stations += [plan.stations[k], *plan.path[k + 1 : k + 2]]
             elif after == n_ways:
                 stations += [(row, col)]
             else:
@@ -68,8 +68,7 @@ def _failures(
     """
     n_posts = planner.workspace.n_posts
     for number, mission, goal in missions_of_hazard(state, so_far):
-        cells = cells_of(mission.path)
-        bounds = zip(pairwise(cells), mission.statuses, strict=False)
+        bounds = zip(pairwise(mission.path), mission.statuses, strict=False)
         failed = {ends: status for ends, status in bounds if status in CAUSES}
         if failed:
             for bound in _failed(Trials.from_missions([mission], (), [goal], n_posts)):

@@ -32,7 +32,7 @@ class Driven(NamedTuple):
     """Bounds of a mission in progress.
 
     Attributes:
-        path: Cells so far, from the start to the cell in which the team is now.
+        path: Stations so far, from the start to the cell in which the team is now.
         contact_rate: Contact rates, shape (bound, robot); NaN where not measured.
         trust: Trust after each bound given the rates up to it, shape (bound, robot).
         bands: Quantiles of this trust at the levels `QUANTILES`, shape (quantile, bound, robot).
@@ -40,7 +40,7 @@ class Driven(NamedTuple):
         filter: Trust and parameters after the last bound.
     """
 
-    path: tuple[Cell, ...]
+    path: tuple[Station, ...]
     contact_rate: np.ndarray
     trust: np.ndarray
     bands: np.ndarray
@@ -70,16 +70,16 @@ def follow(
     workspace = plan.workspace
     closed = [*plan.blocked, *blocked]
     if so_far is None:
-        path = _planned(plan.path, cell)
+        path = _planned(plan.stations, cell)
         n_robots = workspace.team.n_robots
         rates = np.full((len(path) - 1, n_robots), np.nan)
         n_ticks = rates
         z = workspace.along(path, anywhere=True)
     else:
-        path = so_far.path[: len(so_far.bounds) + 1]
-        if path[0][:2] != plan.path[0][:2]:
+        path = so_far.driven_stations
+        if so_far.path[0] != plan.start:
             raise TrustboError(
-                f"the mission starts in cell {path[0][:2]}; it must start in {plan.path[0][:2]}."
+                f"the mission starts in cell {so_far.path[0]}; it must start in {plan.start}."
             )
 
         rates = so_far.contact_rate
@@ -135,8 +135,7 @@ def _returned(path: tuple[Station, ...], cell: Cell, so_far: Mission) -> tuple[S
 
 def failed_bounds(mission: Mission) -> list[Pair]:
     """Return the cells left and entered of each bound that failed."""
-    cells = cells_of(mission.path)
-    bounds = zip(pairwise(cells), mission.statuses, strict=False)
+    bounds = zip(pairwise(mission.path), mission.statuses, strict=False)
     return [bound for bound, status in bounds if status in CAUSES]
 
 
@@ -178,10 +177,10 @@ def plan_rest(
     rng = np.random.default_rng([state.seed_of("policy"), n_driven])
     draws = driven.filter.resample()
     rest = choose(policy, state.settings["policy"], rng, draws, planner)
-    rest = rest.with_draws(planner.evaluate(rest.path, draws))
+    rest = rest.with_draws(planner.evaluate(rest.stations, draws))
     whole = whole_plan(base.problem, driven, rest)
     if so_far is not None and not _is_completed(so_far):
-        whole = replace(whole, abandoned=(*plan.abandoned, plan.path))
+        whole = replace(whole, abandoned=(*plan.abandoned, plan.stations))
     return with_past_failures(whole, state, planner, so_far), risk
 
 
@@ -197,7 +196,7 @@ def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:
         driven: Bounds so far.
         rest: Plan from the last cell of `driven` to the goal.
     """
-    path = (*driven.path[:-1], *rest.path)  # with the posts that the rest begins with
+    path = (*driven.path[:-1], *rest.stations)  # with the posts that the rest begins with
     n_driven = len(driven.path) - 1
 
     risk = rest.risk
@@ -215,6 +214,7 @@ def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:
     return replace(
         rest,
         path=path,
+        post_sets=(),  # as in the path
         trust=np.concatenate([driven.trust, rest.trust]),
         bands=np.concatenate([driven.bands, rest.bands], axis=1),
         value=rest.value - lost,

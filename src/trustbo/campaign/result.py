@@ -259,7 +259,7 @@ class Result(Summary):
             return state.entries[-1].course.ends
 
         here = [mission.path for mission in state.earlier.missions if not mission.map]
-        return (here[-1][0][:2], here[-1][-1][:2]) if here else None
+        return (here[-1][0], here[-1][-1]) if here else None
 
     def _course(
         self,
@@ -352,7 +352,7 @@ class Result(Summary):
         try:
             plan = planner.plan(mean)
         except InfeasibleError as error:
-            return planner.evaluate(error.path, mean)
+            return planner.evaluate(error.stations, mean)
         return instead_of_failure(planner, plan, belief)
 
     def plan(
@@ -388,7 +388,7 @@ class Result(Summary):
     def _with_bands(self, course: Course) -> Plan:
         planner = self.planner_of(course)
         best = with_past_failures(self._recommended(course), self.state, planner)
-        return best.with_draws(planner.evaluate(best.path, self.forecast))
+        return best.with_draws(planner.evaluate(best.stations, self.forecast))
 
     @property
     def path(self) -> list[Cell]:
@@ -474,7 +474,7 @@ class Result(Summary):
         Example:
             >>> result.compare_posts().query("chosen")
         """
-        return self.planner.compare_posts(self.path, self.belief)
+        return self.planner.compare_posts(self.plan().stations, self.belief)
 
     def watchers(
         self,
@@ -504,7 +504,7 @@ class Result(Summary):
             >>> float(whole["at_least_two"].mean() - part["at_least_two"].mean())
         """
         course = self._shown(start, goal, robots)
-        path = self._of_course("plan", course, lambda: self._with_bands(course)).path
+        path = self._of_course("plan", course, lambda: self._with_bands(course)).stations
         measured = [entry.measured for entry in self.state.entries if entry.exclusion is None]
         return self.planner_of(course).watchers(path, self.forecast, missions=measured)
 
@@ -555,14 +555,14 @@ class Result(Summary):
 
         rows = {label: state.earlier_row(i) for label, i in earlier.items()}
         planned = [state.earlier.planned[i] for i in earlier.values()]
-        driven = [state.earlier.missions[i].path for i in earlier.values()]
+        driven = [state.earlier.missions[i].stations for i in earlier.values()]
         stations = [(one or (path,))[0] for one, path in zip(planned, driven, strict=True)]
         like = state.entries[0].trust_map if state.entries else self.workspace.passable
         maps = [xr.full_like(like, np.nan, dtype=float)] * len(rows)
 
         for j, entry in enumerate(state.entries):
             rows[j + 1] = state.row(j)
-            stations.append(entry.plan.path)
+            stations.append(entry.plan.stations)
             maps.append(entry.trust_map)
 
         paths = [cells_along(path).tolist() for path in stations]
@@ -570,7 +570,8 @@ class Result(Summary):
         numbers = pd.Index([*rows], name="iteration")
         table = pd.DataFrame([*rows.values()], numbers)
 
-        text = [name for name in ("where", "failed_bounds", "n_bounds", "path") if name in table]
+        dropped = ("where", "failed_bounds", "n_bounds", "path", "posts")
+        text = [name for name in dropped if name in table]
         history = table.drop(columns=text).to_xarray()
         history["path"] = ("iteration", "step", "axis"), steps
         if self.workspace.n_posts > 1:
@@ -673,7 +674,7 @@ class Result(Summary):
             require_kind("truth", truth, Truth, "give simulation.Truth.from_simulator(simulator)")
 
             longest = self.state.settings["max_bounds"]
-            paths = [entry.plan.path for entry in self.state.entries]
+            paths = [entry.plan.stations for entry in self.state.entries]
             regret = [truth.at(n).regret(path, longest) for n, path in enumerate(paths)]
             unknown = [np.nan] * (history.sizes["iteration"] - len(paths))  # earlier missions
             history = history.assign(regret=("iteration", [*unknown, *regret]))

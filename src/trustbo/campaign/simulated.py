@@ -1,5 +1,6 @@
 """Missions of a campaign in a simulator."""
 
+import inspect
 import json
 from collections.abc import Callable, Generator, Sequence
 from typing import Any
@@ -67,12 +68,18 @@ def run_missions(
             n = len(campaign.state.entries)
             plan = ask(*courses[n % len(courses)]) if courses else ask()
             seed = campaign.state.seed_of("mission")
-            mission = simulator.run(plan.path, seed=seed, mission=n)
+            mission = simulator.run(plan.path, seed=seed, mission=n, **sets_for(simulator, plan))
             tell(mission, again=True)  # a simulator without noise may repeat itself
             bar.set_postfix_str(in_a_line(campaign.state.row(n)), refresh=False)
             bar.update()
             yield plan, mission
     return reason
+
+
+def sets_for(simulator: Simulator, plan: Plan) -> dict[str, Sequence[str]]:
+    """Return the argument `post_sets` for a simulator that has it, if not all are standard."""
+    reads = plan.post_sets and "post_sets" in inspect.signature(simulator.run).parameters
+    return {"post_sets": plan.post_sets} if reads else {}
 
 
 def _reason_to_end(campaign: Result, n_iterations: int, stop: Stop | None) -> str | None:

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.campaign.course import Course
-from trustbo.data import Cell, Mission, Station, cells_of, path_text
+from trustbo.data import Cell, Mission, Station, cells_of, path_text, split_path
 from trustbo.errors import TrustboError
 from trustbo.files import read_file
 from trustbo.hazard.trials import LostMission
@@ -37,14 +37,14 @@ class Failure(NamedTuple):
     Attributes:
         after: Number of missions recorded before it.
         reason: Reason, one of `hazard.CAUSES` if a bound failed.
-        path: Planned path, start first; empty if no bound caused the failure.
+        path: Stations of the planned path, start first; empty if no bound caused the failure.
         where: Cell that the team failed to enter, if known.
         withdrawn: Reason why a user has withdrawn the report, or an empty string.
     """
 
     after: int
     reason: str
-    path: tuple[Cell, ...] = ()
+    path: tuple[Station, ...] = ()
     where: Cell | None = None
     withdrawn: str = ""
 
@@ -150,12 +150,13 @@ class Exclusion(NamedTuple):
 def measures_of(mission: Mission, path: Sequence[Station]) -> dict[str, Any]:
     """Return what a mission measured on a planned path, by column of `Result.table`."""
     n_planned = len(mission.path) - 1
-    if mission.path[-1][:2] != path[-1][:2]:  # the path no longer contained the goal
+    if mission.path[-1] != path[-1][:2]:  # the path no longer contained the goal
         n_planned = max(n_planned, len(path) - 1)
     rates = mission.contact_rate
     failed = [cell for _, cell, _ in incomplete_bounds(mission)]
     contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
     lost = _contact_lost(rates, n_planned)
+    _, post_sets = split_path(path)
 
     return {
         "contact_rate": contact,
@@ -167,6 +168,7 @@ def measures_of(mission: Mission, path: Sequence[Station]) -> dict[str, Any]:
         "n_bounds": len(mission.bounds),
         "n_unmeasured": int(np.isnan(rates).all(axis=1).sum()),
         "path": path_text(path),
+        **({"posts": " ".join(post_sets)} if post_sets else {}),
     }
 
 
@@ -212,7 +214,7 @@ class Entry:
     @cached_property
     def measures(self) -> dict[str, Any]:
         """Values of the mission in `Result.table`, by column, that depend on nothing else."""
-        of_mission = measures_of(self.mission, self.plan.path)
+        of_mission = measures_of(self.mission, self.plan.stations)
         return self.course.to_row() | of_mission | {"objective": self.plan.value}
 
 
@@ -222,7 +224,7 @@ type Planned = tuple[tuple[Station, ...], ...]
 
 def planned_paths(plan: Plan) -> Planned:
     """Return the planned paths of a mission."""
-    return (plan.path, *plan.abandoned)
+    return (plan.stations, *plan.abandoned)
 
 
 class EarlierMissions(NamedTuple):
@@ -322,7 +324,7 @@ class State:
     def earlier_row(self, i: int) -> dict[str, Any]:
         """Return the row in `Result.table` of the earlier mission with index i."""
         mission = self.earlier.missions[i]
-        planned = self.earlier.planned[i] or (mission.path,)
+        planned = self.earlier.planned[i] or (mission.stations,)
         path = planned[0]
 
         measured = np.isfinite(mission.contact_rate).any(0)
@@ -353,7 +355,7 @@ class State:
         before = self.entries[max(j - 1, 0)]
         return {
             **entry.measures,
-            "path_changed": entry.plan.path != before.plan.path,
+            "path_changed": entry.plan.stations != before.plan.stations,
             "replanned": entry.plan.is_replanned,
             "state": state,
             "reason": reason,

@@ -72,7 +72,7 @@ class RegretBound:
                 return None
 
             best = campaign.recommend(*course.ends, robots=course.robots)
-            bounds = tuple(risk.pairs_along(best.path).T)
+            bounds = tuple(risk.pairs_along(best.stations).T)
             was_completed = risk.trials[bounds] > risk.failures[bounds]
             if not was_completed.all():
                 return None
@@ -92,7 +92,7 @@ class RegretBound:
         draws = campaign.learner.draws(posterior(), campaign.workspace)
         draws = draws.in_order(planner.workspace.team.names, planner.workspace.features)
         try:
-            path = planner.plan(draws.mean()).path
+            path = planner.plan(draws.mean()).stations
             drawn = planner.plan_draws(draws, n_draws=_N_DRAWS)
         except InfeasibleError:  # no path satisfies `max_failure`
             return 0.0

@@ -374,7 +374,7 @@ def _check_coverage(
     is_new = np.zeros((pit.sizes["mission"], pit.sizes["bound"]), bool)
     for row, j in zip(is_new, pit["mission"].values, strict=True):
         measured = {bound for mission in missions[:j] for bound in _measured(mission)}
-        new = [bound not in measured for bound in pairwise(missions[j].path or ())]
+        new = [bound not in measured for bound in pairwise(missions[j].stations)]
         row[: len(new)] = new[: len(row)]
 
     is_inside = (abs(pit - 0.5) <= 0.5 * _COVERAGE).where(pit.notnull())
@@ -388,7 +388,7 @@ def _check_coverage(
 def _measured(mission: Mission) -> list[tuple[Station, Station]]:
     """Return the bounds of a mission in which a rate was measured."""
     has_rate = np.isfinite(mission.contact_rate).any(-1)
-    bounds = pairwise(mission.path or ())
+    bounds = pairwise(mission.stations)
     return [bound for bound, known in zip(bounds, has_rate, strict=False) if known]
 
 

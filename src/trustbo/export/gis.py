@@ -112,7 +112,7 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
         features.append(_feature(plan, "bounds", place, {"bound": k, **known, "cell": cell}))
 
     team = plan.workspace.team
-    sets = posts_along(plan.path)
+    sets = posts_along(plan.stations)
     for k, (cell, places) in enumerate(zip(cells, _of(plan.posts), strict=False), start=1):
         for robot, place in zip(team.names, places, strict=True):
             about = {"bound": k, "robot": robot, "driven": k <= plan.n_driven, "cell": cell}

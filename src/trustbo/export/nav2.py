@@ -167,7 +167,7 @@ def write_nav2(
     folder = to_path(folder)
     plan = result.plan() if isinstance(result, Result) else result
     workspace = result.workspace
-    place = Frame(workspace.grid.center(plan.path[0][:2])) if frame is None else frame
+    place = Frame(workspace.grid.center(plan.path[0])) if frame is None else frame
 
     # All contents are made before the first file is written, so that an error leaves no incomplete
     # set of files.

@@ -154,7 +154,7 @@ def _pairs_along(path: Sequence[Station], n_posts: int) -> np.ndarray:
 
 def _reported(mission: Mission, goal: Cell | None, n_posts: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds that were completed or failed, (bound, 4), and whether each one failed."""
-    path = cells_of(mission.path)
+    path = mission.path
     statuses = mission.statuses
 
     fails = np.array([status in CAUSES for status in statuses])
@@ -166,7 +166,7 @@ def _reported(mission: Mission, goal: Cell | None, n_posts: int) -> tuple[np.nda
 
     # A path contains the planned cells after the last bound, unless the log ends there or the
     # mission was replanned. Robots that turn back after a failure did not plan to.
-    tried = _pairs_along(mission.path[: len(statuses) + 2], n_posts)[: len(statuses)]
+    tried = _pairs_along(mission.stations[: len(statuses) + 2], n_posts)[: len(statuses)]
     for k in np.flatnonzero(fails):
         is_last = k + 2 == len(path)
         turns_back = not is_last and path[k + 2] == path[k]

@@ -138,7 +138,7 @@ def _scored(trust: TrustFilter, mission: Mission, rng: np.random.Generator) -> x
     z = mission.awareness
     y = mission.contact_rate
     counts = trust.space.grouped(mission.n_ticks)
-    path = mission.path[: len(z) + 1] if trust.params.grid_shape and mission.path else None
+    path = mission.stations[: len(z) + 1] if trust.params.grid_shape and mission.path else None
 
     log_score = np.empty(y.shape)
     drawn = []

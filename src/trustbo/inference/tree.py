@@ -197,7 +197,7 @@ def _data_groups(
     duration = padded([mission.duration for mission in missions], np.nan)
     cells = [np.array([bound.cell for bound in mission.bounds]) for mission in missions]
     cell = padded(cells, -1)
-    starts = [mission.path[0][:2] if mission.path else NOWHERE for mission in missions]
+    starts = [mission.path[0] if mission.path else NOWHERE for mission in missions]
 
     constant: dict[str, Any] = {
         "awareness": ((*_OF_RATES, "feature"), observed.awareness),

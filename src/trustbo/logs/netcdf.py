@@ -112,7 +112,7 @@ def missions_to_tree(missions: Iterable[Mission]) -> xr.DataTree:
     ]
     poses, contacts = zip(*ticks, strict=True)
 
-    steps = [station for mission in missions for station in mission.path]
+    steps = [station for mission in missions for station in mission.stations]
     cells = cells_of(steps)
     variables: dict[str, Any] = {
         "path": (("step", "axis"), np.reshape(cells, (-1, 2)).astype(int)),

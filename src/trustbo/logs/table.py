@@ -70,7 +70,7 @@ def to_frame(missions: Iterable[Mission]) -> pd.DataFrame:
             for i, robot in enumerate(mission.robots):
                 row: dict[str, Any] = dict(zip(KEYS, (j, k, robot), strict=True))
                 if mission.path:
-                    row["row"], row["col"], row[POSTS] = (*mission.path[k], POST_SETS[0])[:3]
+                    row["row"], row["col"], row[POSTS] = (*mission.stations[k], POST_SETS[0])[:3]
                 if 1 <= k <= n_run:
                     bound = mission.bounds[k - 1]
                     row |= {name: getattr(bound, name)[i] for name in RATES}
@@ -79,7 +79,7 @@ def to_frame(missions: Iterable[Mission]) -> pd.DataFrame:
                 rows.append(row)
 
     absent = set() if missions[0].path else {"row", "col"}
-    if all(len(station) == 2 for mission in missions for station in mission.path):
+    if not any(mission.post_sets for mission in missions):
         absent.add(POSTS)
     names = [name for name in COLUMNS if name not in absent]
     return pd.DataFrame(rows, columns=[*names, *missions[0].features])

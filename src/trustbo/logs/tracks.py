@@ -176,7 +176,7 @@ def _warn_of_unnamed_posts(path: Sequence[Station], workspace: Workspace) -> Non
     if workspace.n_posts > 1 and all(len(station) == 2 for station in path):
         warn(
             "the path has no sets of posts, so the subteam counts as being at the standard ones; "
-            "pass the path of the plan, or find the sets by workspace.with_posts(mission, ...)."
+            "pass the stations of the plan as path, or post_sets=workspace.post_sets_of(path, ...)."
         )
 
 

@@ -45,7 +45,7 @@ def bounds_of(missions: Sequence[Mission]) -> np.ndarray:
     bounds = []
     for j, mission in enumerate(missions):
         try:
-            bounds.append(bounds_along(mission.driven))
+            bounds.append(bounds_along(mission.driven_stations))
         except TrustboError as error:
             raise TrustboError(
                 f"mission {j}: {error} A model with place effects needs paths without jumps; omit "

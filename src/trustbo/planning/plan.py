@@ -10,11 +10,19 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import pandas as pd
 
-from trustbo.data import POST_SETS, Cell, Station, cells_of, path_text
+from trustbo.data import (
+    POST_SETS,
+    Cell,
+    Station,
+    cells_of,
+    path_text,
+    split_path,
+    stations_of,
+)
 from trustbo.display import Rows, Summary, joined
 from trustbo.hazard.path_risk import PathRisk
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import cells_along, posts_along
+from trustbo.workspace.moves import cells_along
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
 """Quantile levels of `Plan.bands`: the ends of the 90 % and the 50 % bands."""
@@ -37,8 +45,8 @@ class PastFailure(NamedTuple):
     """Status of the bound that failed, such as "tipped"."""
     way: tuple[Station, ...]
     """The cell left and the cell entered in the bound that failed, and the cell after them, if any,
-    with the sets of posts as in `Plan.path`. If the planned next move is not known, the cell after
-    them is that of the plan."""
+    with the sets of posts as in `Plan.stations`. If the planned next move is not known, the cell
+    after them is that of the plan."""
     p_fail: float
     """Posterior mean probability that a bound on this way fails; compare `Plan.p_fail`."""
 
@@ -51,9 +59,7 @@ class Plan(Summary):
     workspace has no terrain, these properties are None.
 
     Attributes:
-        path: Cells from start to goal, each (row, col), or (row, col, name) if T2 watches the
-            lead's move out of the cell from another set of posts than the standard one; see
-            `Workspace.from_terrain`.
+        path: Cells (row, col) from start to goal.
         trust: Expected trust after each bound, shape (bound, robot).
         bands: Quantiles of expected trust over the parameter draws, shape (quantile, bound, robot),
             for the levels in `QUANTILES`. With one draw, the bands equal `trust`.
@@ -73,13 +79,16 @@ class Plan(Summary):
         n_driven: Number of bounds of the path before `path[n_driven]`, the cell in which the team
             was when the mission was replanned; otherwise 0. The way back after a bound that failed
             counts as driven.
-        abandoned: Planned paths of this mission on which a bound failed, before it was replanned.
+        abandoned: Planned paths of this mission on which a bound failed, before it was replanned,
+            as in `stations`.
         value_band: Ends of the 90 % band of the value over the draws, computed with the mean
             failure probability; None with one draw. `value` may lie outside the band, because it
             limits trust to 1.
         past_failures: Failures of past missions at known bounds into the cells that this path
             enters, as named tuples with the fields `bound`, `mission`, `status`, `way` and
             `p_fail`; only the plans of campaigns have them.
+        post_sets: Name of the set of posts from which T2 watches each bound (see
+            `Workspace.from_terrain`); empty if all are standard.
 
     Example:
         >>> plan = tb.Planner(workspace, (9, 0), (0, 9)).plan(posterior)
@@ -88,7 +97,7 @@ class Plan(Summary):
         >>> plan.trust.mean(axis=0)  # of each robot
     """
 
-    path: tuple[Station, ...]
+    path: tuple[Cell, ...]
     trust: np.ndarray
     bands: np.ndarray
     value: float
@@ -104,6 +113,12 @@ class Plan(Summary):
     n_driven: int = 0
     abandoned: tuple[tuple[Station, ...], ...] = ()
     past_failures: tuple[PastFailure, ...] = ()
+    post_sets: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        path, post_sets = split_path(self.path, self.post_sets)
+        object.__setattr__(self, "path", path)
+        object.__setattr__(self, "post_sets", post_sets)
 
     def with_draws(self, given: Self) -> Self:
         """Return this plan with the bands of `given`, a plan for the same path and many draws."""
@@ -116,6 +131,7 @@ class Plan(Summary):
 
         rows = [
             ("path", f"{path_text(self.path)}: {len(self.path) - 1} bounds, {self.length:.0f} m"),
+            *([("posts", sets_text(self.post_sets))] if self.post_sets else []),
             ("value", f"{self.value:z.3g} ({self.objective}){in_draws(self.value_band)}"),
             ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
@@ -164,9 +180,10 @@ class Plan(Summary):
 
         places = self.positions if self.stops is None else self.stops
         table = pd.DataFrame(places, columns=["x", "y"]).rename_axis("bound")
-        table.insert(0, "cell", [path_text([cell[:2]]) for cell in self.path])
+        table.insert(0, "cell", [path_text([cell]) for cell in self.path])
         if self.workspace.n_posts > 1:
-            table["posts"] = [*map(POST_SETS.__getitem__, posts_along(self.path)), ""]
+            standard = POST_SETS[:1] * (len(self.path) - 1)
+            table["posts"] = [*(self.post_sets or standard), ""]
         return table.join(pd.DataFrame(of_bounds, index=table.index[1:]))
 
     def _trust_columns(self, name: str, robots: slice) -> dict[str, np.ndarray]:
@@ -174,15 +191,24 @@ class Plan(Summary):
         values = {name: self.trust, f"{name}_low": self.bands[0], f"{name}_high": self.bands[-1]}
         return {column: value[:, robots].mean(1) for column, value in values.items()}
 
+    @cached_property
+    def stations(self) -> tuple[Station, ...]:
+        """Path as cells (row, col), or (row, col, name) if a bound has another set than standard.
+
+        The name belongs to the lead's move out of the cell. Functions that take a path also take
+        stations.
+        """
+        return stations_of(self.path, self.post_sets)
+
     @property
     def start(self) -> Cell:
         """First cell of the path."""
-        return self.path[0][:2]
+        return self.path[0]
 
     @property
     def goal(self) -> Cell:
         """Last cell of the path."""
-        return self.path[-1][:2]
+        return self.path[-1]
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -204,7 +230,7 @@ class Plan(Summary):
     @property
     def revisits(self) -> int:
         """Number of bounds that enter a cell that the path has already visited."""
-        return len(self.path) - len({cell[:2] for cell in self.path})
+        return len(self.path) - len(set(self.path))
 
     @property
     def is_replanned(self) -> bool:
@@ -235,7 +261,7 @@ class Plan(Summary):
         posts = self.workspace.posts
         if posts is None:
             return None
-        return np.stack([posts.watching(*bound) for bound in pairwise(self.path)])
+        return np.stack([posts.watching(*bound) for bound in pairwise(self.stations)])
 
     @cached_property
     def routes(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:
@@ -248,9 +274,20 @@ class Plan(Summary):
         if posts is None:
             return None
 
-        path = self.path
+        path = self.stations
         onward = [*path[2:], None]  # T2 moves to its posts for the bound to this cell
         return tuple(map(posts.bound_routes, path, path[1:], onward))
+
+
+def sets_text(post_sets: Sequence[str]) -> str:
+    """Describe the sets of posts of bounds, such as "far in bounds 2 and 3, else standard"."""
+    texts = []
+    for name in POST_SETS[1:]:
+        bounds = [str(k) for k, of_bound in enumerate(post_sets, 1) if of_bound == name]
+        if bounds:
+            texts.append(f"{name} in bound{'s' * (len(bounds) > 1)} {joined(bounds)}")
+    rest = ", else " + POST_SETS[0] if POST_SETS[0] in post_sets else ""
+    return "; ".join(texts) + rest
 
 
 def in_draws(band: tuple[float, float] | None, sign: float = 1.0) -> str:
@@ -274,7 +311,7 @@ def past_failures_of(plan: Plan) -> list[str]:
     ways: dict[int, dict[Any, list[PastFailure]]] = {}
     for failure in plan.past_failures:
         k = failure.bound
-        same = failure.way[0][:2] == plan.path[k - 1][:2] and math.isclose(
+        same = failure.way[0][:2] == plan.path[k - 1] and math.isclose(
             failure.p_fail, p_fail[k - 1], rel_tol=_ROUNDING
         )
         way = None if same else (failure.way, failure.p_fail)
@@ -282,14 +319,14 @@ def past_failures_of(plan: Plan) -> list[str]:
 
     texts = []
     for k, of_bound in ways.items():
-        left, entered = cells_of(plan.path[k - 1 : k + 1])
+        left, entered = plan.path[k - 1 : k + 1]
         text = f"bound {k} enters {path_text([entered])} from {path_text([left])} with failure "
         text += f"probability {p_fail[k - 1]:.2g}{_when(of_bound.pop(None))}"
         for (way, failed), failures in of_bound.items():
             failed_left, _, *after = cells_of(way)
             side = f"from {path_text([failed_left])}"
             if failed_left == left:
-                same_next = after == cells_of(plan.path[k + 1 : k + 2])
+                same_next = after == [*plan.path[k + 1 : k + 2]]
                 side = "with other posts" if same_next else "before another next move"
             text += f"; {side}, it is {failed:.2g}{_when(failures)}"
         texts.append(text)

@@ -56,7 +56,7 @@ def thompson(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
     """
     _require(rng, params, planner)
     plan = planner.plan(params.draw(int(rng.integers(params.n_draws))))
-    return planner.evaluate(plan.path, params.mean())
+    return planner.evaluate(plan.stations, params.mean())
 
 
 def optimistic(
@@ -137,7 +137,7 @@ def explore(
         return plan
 
     drawn = planner.plan_draws(params, n_draws=N_DRAWS, seed=_seed(rng))
-    if np.mean(drawn.relative_regret(plan.path) > regret) <= doubt:
+    if np.mean(drawn.relative_regret(plan.stations) > regret) <= doubt:
         return plan
     return planner.evaluate(_most_promising(drawn, kappa=1.0), params.mean())
 

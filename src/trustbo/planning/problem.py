@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled, require_numbers
-from trustbo.data import Cell, Station
+from trustbo.data import Station, cells_of, path_text
 from trustbo.errors import TrustboError, require_kind, require_positive
 from trustbo.hazard.path_risk import ROUNDING, Risk
 from trustbo.inference.learner import next_mission_of
@@ -42,7 +42,8 @@ class InfeasibleError(TrustboError):
     """No admissible path respects `max_failure`.
 
     Attributes:
-        path: The safest admissible path.
+        path: Cells of the safest admissible path.
+        stations: The same path with its sets of posts; see `Plan.stations`.
         p_fail: Failure probability of the safest path.
 
     Example:
@@ -55,14 +56,15 @@ class InfeasibleError(TrustboError):
         9 bounds
     """
 
-    def __init__(self, message: str, path: tuple[Cell, ...], p_fail: float) -> None:
+    def __init__(self, message: str, stations: tuple[Station, ...], p_fail: float) -> None:
         super().__init__(message)
-        self.path = path
+        self.path = tuple(cells_of(stations))
+        self.stations = stations
         self.p_fail = p_fail
 
     def __reduce__(self) -> tuple[Any, ...]:
         # By default, pickle would call the class with the message alone.
-        return type(self), (str(self), self.path, self.p_fail)
+        return type(self), (str(self), self.stations, self.p_fail)
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,7 +344,7 @@ class Problem:
             self._raise_infeasible()
         return -cost, -lower, paths
 
-    def safest(self) -> tuple[tuple[Cell, ...], float]:
+    def safest(self) -> tuple[tuple[Station, ...], float]:
         """Find the admissible path with the smallest failure probability; requires a risk.
 
         Returns:
@@ -394,9 +396,10 @@ class Problem:
                 "max_failure, or reduce max_bounds."
             )
         raise InfeasibleError(
-            f"no admissible path from {path[0]} to {path[-1]} has a failure probability of at most "
-            f"max_failure = {self.max_failure:g}. The smallest is {p_fail:.4g} on the path {path}. "
-            "Increase max_failure or max_bounds, or use this path (attribute `path` of the error).",
+            f"no admissible path from {self.paths.start} to {self.paths.goal} has a failure "
+            f"probability of at most max_failure = {self.max_failure:g}. The smallest is "
+            f"{p_fail:.4g} on the path {path_text(path)}. Increase max_failure or max_bounds, or "
+            "use this path (attribute `path` of the error).",
             path,
             p_fail,
         )

@@ -123,7 +123,7 @@ def _residuals(
     for k, mission in enumerate(missions):
         z = np.swapaxes(mission.awareness, 0, 1).copy()
         z[..., [name == THREAT for name in workspace.features]] = 0.0  # it is to be explained
-        along = bounds_along(mission.driven)
+        along = bounds_along(mission.driven_stations)
         expected = states_along(trust_recursion(plain, z, bounds=along, by_robot=True))[0]
         of_team = z[..., columns].mean((0, -1)) if columns else np.full(len(along), 0.5)
 

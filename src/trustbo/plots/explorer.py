@@ -211,7 +211,7 @@ def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.n
     for i in range(history.sizes["iteration"]):
         mission = history.isel(iteration=i)
         values = shown_values(mission["trust_map"], workspace)
-        values[path_in(mission)[0][:2]] = np.nan  # assumed
+        values[path_in(mission)[0]] = np.nan  # assumed
         layers[f"mission {int(mission['iteration'])}"] = values
     return layers
 
@@ -249,7 +249,7 @@ def _draw_plan(plot: Any, plan: Plan) -> None:
     path = _places(plan.path, grid)
     for colour, width in (("black", 5), ("white", 3)):
         plot.line(**path, color=colour, line_width=width, legend_label="recommended")
-    sets = posts_along(plan.path)
+    sets = posts_along(plan.stations)
     for i in np.flatnonzero(sets):
         bound = {axis: places[i : i + 2] for axis, places in path.items()}
         look = {"color": COLOURS_OF_SETS[sets[i]], "legend_label": f"{POST_SETS[sets[i]]} posts"}

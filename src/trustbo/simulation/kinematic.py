@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Mission, Station
+from trustbo.data import Cell, Mission, Station
 from trustbo.errors import TrustboError, require_kind, require_list, require_positive, require_whole
 from trustbo.simulation.events import Event
 from trustbo.simulation.motion import drive_together
@@ -146,18 +146,27 @@ class KinematicSimulator(DescribedSimulator):
                 world = event.change(world)
         return world
 
-    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
+    def run(
+        self,
+        path: Sequence[Cell],
+        *,
+        seed: int,
+        mission: int = 0,
+        post_sets: Sequence[str] = (),
+    ) -> Mission:
         """Run a path to the goal or until a bound fails.
 
         Args:
             path: Cells, each a neighbour of the previous one.
             seed: Seed of wheel slip and detections; the same seed gives the same mission.
             mission: Number of the mission, from 0, which determines the active events.
+            post_sets: Name of the set of posts for each bound, such as `Plan.post_sets`; by
+                default, all are standard.
 
         Raises:
             TrustboError: A cell is off the grid or impassable, or there are fewer than two cells.
         """
-        cells = require_path(self.workspace, path)
+        cells = require_path(self.workspace, path, post_sets)
         seed = require_whole("seed", seed, 0)
         awareness = self.workspace.along(cells)
         world = self.world(mission)

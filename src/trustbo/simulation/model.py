@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled
-from trustbo.data import Mission, Station
+from trustbo.data import Cell, Mission, Station
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.hazard.given import read_risk
 from trustbo.models import PooledTrust
@@ -88,9 +88,16 @@ class ModelSimulator(DescribedSimulator):
 
         self.p_fail = None if p_fail is None else _require_probabilities(p_fail, workspace)
 
-    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
+    def run(
+        self,
+        path: Sequence[Cell],
+        *,
+        seed: int,
+        mission: int = 0,
+        post_sets: Sequence[str] = (),
+    ) -> Mission:
         """Run a path; the result depends on the seed, but not on the number of the mission."""
-        cells = require_path(self.workspace, path)
+        cells = require_path(self.workspace, path, post_sets)
         z = along(self.awareness, cells)  # (robot, bound, feature)
         n_robots, n_bounds = z.shape[:2]
         # Without _STREAM, seed 0 would give the same numbers as `default_rng(0)`.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from trustbo import data
-from trustbo.data import Mission, Station
+from trustbo.data import Cell, Mission, Station
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.workspace import Workspace
@@ -17,18 +17,20 @@ from trustbo.workspace import Workspace
 class Simulator(Protocol):
     """Protocol for objects that run a path, such as a simulator or an interface to real robots.
 
+    If `run` also has the argument `post_sets`, campaigns pass the name of the set of posts for each
+    bound, if not all are standard. The robots of other simulators count as standing at their
+    standard posts.
+
     Two methods are optional. `describe() -> dict` returns settings that a campaign records.
     `describe_world(mission) -> dict` returns the settings of a mission's world for `Truth`. To
     compute a `Truth`, the simulator also needs the attribute `workspace`.
     """
 
-    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
+    def run(self, path: Sequence[Cell], *, seed: int, mission: int = 0) -> Mission:
         """Run a path from its first to its last cell, or until a bound fails.
 
         Args:
-            path: Cells from start to goal, (row, col), or (row, col, name) with the set of posts
-                from which T2 watches the move out of the cell; only workspaces with several sets
-                of posts have names.
+            path: Cells from start to goal, (row, col).
             seed: Random seed.
             mission: Number of the mission, from 0, for simulators whose world changes.
         """
@@ -48,9 +50,11 @@ class DescribedSimulator(Summary):
         return [(name, text) for name, text in rows if len(text) < 200]
 
 
-def require_path(workspace: Workspace, path: Sequence[Station]) -> tuple[Station, ...]:
-    """Return the cells of a path; raises TrustboError unless it has at least 2, all passable."""
-    stations = data.require_path("path", path)
+def require_path(
+    workspace: Workspace, path: Sequence[Station], post_sets: Sequence[str] = ()
+) -> tuple[Station, ...]:
+    """Return the stations of a path; raises TrustboError unless it has at least 2, all passable."""
+    stations = data.stations_of(*data.split_path(path, post_sets))
     for k, (row, col, *_) in enumerate(stations):
         workspace.locate((row, col), f"path[{k}]")
     if len(stations) < 2:

@@ -9,7 +9,7 @@ from scipy import ndimage
 from scipy.special import expit
 from scipy.stats import t as student
 
-from trustbo.data import Mission, Station
+from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
 from trustbo.simulation.replicates import table_of
@@ -81,9 +81,16 @@ class RadioSimulator(DescribedSimulator):
         self.seed = own if seed is None else require_whole("seed", seed, 0)
         self.mean = _mean_contact(workspace, terrain, self.seed)
 
-    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
+    def run(
+        self,
+        path: Sequence[Cell],
+        *,
+        seed: int,
+        mission: int = 0,
+        post_sets: Sequence[str] = (),
+    ) -> Mission:
         """Run a path; the result depends on the seed, but not on the number of the mission."""
-        cells = require_path(self.workspace, path)
+        cells = require_path(self.workspace, path, post_sets)
         entered = cells_along(cells)[1:].T
         mean = self.mean[:, moves_along(cells), *entered].T  # (bound, robot)
         rng = np.random.default_rng(require_whole("seed", seed, 0))

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from trustbo.data import Bound, Mission, Station
+from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.simulation.kinematic import KinematicSimulator
 from trustbo.simulation.protocol import DescribedSimulator, digest
@@ -116,9 +116,17 @@ class RealtimeAwareness(DescribedSimulator):
         """Return the settings of a mission's world, which are equal for equal worlds."""
         return self.simulator.describe_world(mission)
 
-    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
+    def run(
+        self,
+        path: Sequence[Cell],
+        *,
+        seed: int,
+        mission: int = 0,
+        post_sets: Sequence[str] = (),
+    ) -> Mission:
         """Run a path and measure awareness; see `KinematicSimulator.run`."""
-        return self.measured(self.simulator.run(path, seed=seed, mission=mission), number=mission)
+        run = self.simulator.run(path, seed=seed, mission=mission, post_sets=post_sets)
+        return self.measured(run, number=mission)
 
     def inputs(self, bound: Bound, *, number: int = 0) -> dict[str, dict[str, np.ndarray]]:
         """Compute the inputs of each feature (see `SIGNS`), each of shape (robot,).

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 
-from trustbo.data import Mission, Station, path_text, require_map, require_path
+from trustbo.data import Cell, Mission, path_text, require_map, split_path, stations_of
 from trustbo.errors import TrustboError, require_whole
 from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.stacking import list_of_missions
@@ -44,7 +44,14 @@ class ReplaySimulator(DescribedSimulator):
         n = len(self.missions)
         return {"simulator": type(self).__name__, "missions": n, "any_path": self.any_path}
 
-    def run(self, path: Sequence[Station], *, seed: int, mission: int = 0) -> Mission:
+    def run(
+        self,
+        path: Sequence[Cell],
+        *,
+        seed: int,
+        mission: int = 0,
+        post_sets: Sequence[str] = (),
+    ) -> Mission:
         """Return the recorded mission with the number `mission`; `seed` is not used.
 
         Raises:
@@ -57,8 +64,8 @@ class ReplaySimulator(DescribedSimulator):
             )
 
         recorded = self.missions[mission]
-        asked = require_path("path", path)
-        if recorded.path != asked and not self.any_path:
+        asked = stations_of(*split_path(path, post_sets))
+        if recorded.stations != asked and not self.any_path:
             raise TrustboError(
                 f"mission {mission} was recorded on the path {path_text(recorded.path)}, not on "
                 f"{path_text(asked)}; set any_path=True to replay the mission anyway."

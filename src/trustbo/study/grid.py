@@ -251,7 +251,7 @@ def _rows(
                 **_recommended(path, scene, number),
                 "status": mission.status,
                 "contact_rate": contact_rate,
-                **_driven(mission.path, scene, number - 1),
+                **_driven(mission.stations, scene, number - 1),
                 "seconds": seconds,
             }
             began = time.process_time()
@@ -261,7 +261,7 @@ def _path_of(campaign: Campaign, scene: Scene, mission: int) -> Sequence[Cell]:
     """Return the path that a campaign, or its policy, recommends for a mission, from 0."""
     choose = getattr(campaign.policy, "recommend", None)
     if choose is None:
-        return campaign.recommend(*scene.ends(mission)).path
+        return campaign.recommend(*scene.ends(mission)).stations
     if scene.courses:
         raise TrustboError("a policy with a method recommend needs a scene with one course.")
     return choose(campaign)

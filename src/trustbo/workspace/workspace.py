@@ -23,7 +23,6 @@ from trustbo.data import (
     default_features,
     is_predicted,
     require_map,
-    require_path,
 )
 from trustbo.display import Rows, Summary, announced
 from trustbo.errors import (
@@ -461,10 +460,10 @@ class Workspace(Summary):
         awareness = xr.concat([known, added.copy(data=values)], "feature")
         return dataclasses.replace(self, awareness=awareness.rename("awareness"))
 
-    def with_posts(
+    def post_sets_of(
         self, path: Sequence[Cell], stood: ArrayLike, *, within: float = 10.0
-    ) -> tuple[Station, ...]:
-        """Return a path with the set of posts nearest to where T2 stood before each bound.
+    ) -> tuple[str, ...]:
+        """Return the name of the set of posts nearest to where T2 stood before each bound.
 
         Robots that did not stand at the planned posts can thus tell a mission; only the set is
         learned from, not the positions.
@@ -482,10 +481,11 @@ class Workspace(Summary):
 
         Example:
             >>> stood = np.stack([bound.poses[0, 1:, :2] for bound in mission.bounds])
-            >>> dataclasses.replace(mission, path=workspace.with_posts(mission.path, stood))
+            >>> sets = workspace.post_sets_of(mission.path, stood)
+            >>> mission = dataclasses.replace(mission, post_sets=sets)
         """
         if self.posts is None:
-            raise TrustboError("with_posts needs the posts of a workspace made from a terrain.")
+            raise TrustboError("post_sets_of needs the posts of a workspace made from a terrain.")
 
         cells = [self.locate((a[0], a[1]), f"path[{k}]") for k, a in enumerate(path)]
         places = np.asarray(stood, float)
@@ -494,7 +494,7 @@ class Workspace(Summary):
             raise TrustboError(f"stood must be (bound, robot, 2) = {shape}; got {places.shape}.")
 
         require_positive("within", within)
-        stations: list[Station] = []
+        names: list[str] = []
         for k, (a, c) in enumerate(pairwise(cells)):
             posts = np.array([self.posts.watching((*a, name), c) for name in self.post_sets])
             away = np.nan_to_num(np.linalg.norm(posts - places[k], axis=-1))  # (set, robot)
@@ -506,8 +506,8 @@ class Workspace(Summary):
                     f"{self.post_sets[nearest]!r} in cell {a}, and no set is nearer; increase "
                     f"within = {within:g} m, offer more sets (n_posts), or leave this mission out."
                 )
-            stations.append((*a, self.post_sets[nearest]))
-        return require_path("path", [*stations, *cells[-1:]])
+            names.append(self.post_sets[nearest])
+        return tuple(names)
 
     def in_order(self, mission: Mission) -> Mission:
         """Return a mission with its robots and features in the workspace's order.
@@ -546,7 +546,7 @@ class Workspace(Summary):
         if not missing.any():
             return ordered
 
-        known = self.along(ordered.driven, anywhere=True)
+        known = self.along(ordered.driven_stations, anywhere=True)
         return ordered.with_awareness(np.where(missing, known, ordered.awareness))
 
     def locate(self, location: Location, what: str = "location") -> Cell:

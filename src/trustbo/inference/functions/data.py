@@ -71,7 +71,7 @@ def data_of(
     bounds = []
     for mission in missions:
         if moves and mission.path:
-            bounds.append(bounds_along(mission.driven))
+            bounds.append(bounds_along(mission.driven_stations))
         else:
             cells = [bound.cell for bound in mission.bounds]  # -1 without a map
             bounds.append(np.insert(cells, 0, _UNKNOWN, axis=1))
