@@ -9,12 +9,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import pytest
+import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import ModelSimulator, random_cells
 
 import trustbo as tb
+from trustbo.campaign import learning
+from trustbo.campaign.state import State
 from trustbo.files import to_json
 from trustbo.hazard.trials import CAUSES
 from trustbo.models import PooledTrust
@@ -530,6 +534,82 @@ def test_failures_of_other_courses_count_like_those_of_earlier_campaigns(workspa
     for name in ("trials", "failures"):
         np.testing.assert_array_equal(together.hazard[name], here.hazard[name])
     assert together.hazard["failures"].sum() == len(told)
+
+
+HAPPENED = st.tuples(
+    st.integers(1, 3),  # bound that fails, unless the mission arrives
+    st.sampled_from(["arrives", "fails", "fails and the log ends", "is replanned"]),
+)
+
+
+def run_and_tell(campaign, k, ends, n_run, outcome):
+    """Run a mission on a course, and tell it; return the mission."""
+    path = campaign.suggest(way(*ends)).path
+    if outcome == "is replanned":
+        left, entered = path[n_run - 1 : n_run + 1]
+        so_far = drive(campaign.workspace, path, k, fail_at=n_run)
+        rest = campaign.replan(left, so_far).path[n_run + 1 :]
+        back = drive(campaign.workspace, (entered, *rest), k)
+        names = ("awareness", "contact_rate", "duration", "n_ticks")
+        both = [np.concatenate([getattr(m, name) for m in (so_far, back)]) for name in names]
+        status = [*so_far.bound_status, *back.bound_status]
+        path = (*path[: n_run + 1], *rest)
+        mission = tb.Mission.from_arrays(path, *both[:2], status=status)
+        campaign.tell(mission)
+        return mission
+
+    fails = outcome != "arrives"
+    mission = drive(campaign.workspace, path, k, fail_at=n_run if fails else None)
+    if outcome.endswith("ends"):
+        mission = replace(mission, path=mission.path[: n_run + 1])
+    campaign.tell(mission)
+    return mission
+
+
+@settings(max_examples=6, deadline=None, derandomize=True)
+@given(
+    first=st.lists(HAPPENED, min_size=1, max_size=3),
+    later=st.lists(HAPPENED, min_size=1, max_size=3),
+)
+def test_missions_of_another_course_teach_like_those_of_an_earlier_campaign(first, later):
+    """The fits begin anew and have the same seed, so results are equal up to rounding.
+
+    If the missions are told in another order, so are the parameters, but not the draws of effects,
+    which are drawn in the order of missions.
+    """
+    workspace = random_cells()
+    happened = [(BACK, *rest) for rest in first] + [(ENDS, *rest) for rest in later]
+    told = list(enumerate(happened))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learning, "_previous", lambda state: None)
+        patch.setattr(State, "seed_of", lambda *_: 0)
+        together, there, reordered = (begin(workspace) for _ in range(3))
+        missions = [run_and_tell(together, k, *one) for k, one in told]
+        for k, one in told[: len(first)]:
+            run_and_tell(there, k, *one)
+
+        here = begin(workspace, earlier=there)
+        for k, one in told[len(first) :]:
+            run_and_tell(here, k, *one)
+
+        for mission, (ends, *_) in reversed(list(zip(missions, happened, strict=True))):
+            reordered.suggest(way(*ends))
+            reordered.tell(mission)
+
+        close = {"rtol": 1e-6, "atol": 1e-9}
+        for group in ("posterior", "hazard"):
+            for name, values in together.posterior[group].data_vars.items():
+                other = here.posterior[group][name]
+                np.testing.assert_allclose(values, other, **close, err_msg=name)
+        for name, values in together.posterior["posterior"].data_vars.items():
+            other = reordered.posterior["posterior"][name]
+            np.testing.assert_allclose(values, other, **close, err_msg=name)
+
+        for ends in (ENDS, BACK):
+            plans = [campaign.plan(*ends) for campaign in (together, here)]
+            pd.testing.assert_frame_equal(*[plan.to_frame() for plan in plans], **close)
+        xr.testing.assert_allclose(together.maps(), here.maps(), **close)
 
 
 def test_the_order_of_missions_of_many_courses_does_not_matter(workspace):
