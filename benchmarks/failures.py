@@ -1,15 +1,6 @@
-"""Predicted and actual failures of plans: the table of docs/failures.md, in Markdown.
+"""Signs of failures, and the failure probability of plans; parts of docs/failures.md, in Markdown.
 
-    python benchmarks/failures.py [part ...] --data DIR --out out/failures
-
-The worlds have tight slope limits and are named terrain:limit:excess. The assumed limit is the true
-limit plus the excess, in degrees. With an excess of 0, the hazard model has the right limit. With a
-larger excess, some bounds that seem passable stop the robots.
-
-The part `reliability` evaluates the plans before missions 1, 2, 3, 5 and 15 of a campaign. It
-compares their predicted arrival probability with the fraction of simulated runs that arrive.
-`product` is the product of 1 - p_fail over the bounds. Each campaign has a file in --out, so the
-script can be resumed. --jobs sets the number of processes.
+    python benchmarks/failures.py [part ...] --data DIR
 
 The part `separation` simulates all bounds with all next moves in the worlds whose slope limit is 2
 degrees too high, and prints how well several measures of tilt separate the bounds that fail from
@@ -20,134 +11,23 @@ means, from components, and from all draws.
 """
 
 import dataclasses
-import json
-import multiprocessing
 import warnings
-from concurrent.futures import ProcessPoolExecutor
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 from common import Table, arguments, parsed
-from world_set import COURSES, World, worlds
+from world_set import worlds
 
 import trustbo as tb
 from trustbo.hazard import Hazard
 from trustbo.hazard.given import GivenRisk
-from trustbo.simulation import KinematicSimulator
 from trustbo.simulation.replicates import replicated
 from trustbo.workspace.difficulty import MEASURES
 from trustbo.workspace.moves import END, MOVES, pairs_along
 
-GROUNDS = (("topography", 18), ("tahoe", 18), ("synthetic-0", 14), ("wellington", 38))
-WORLDS = [f"{ground}:{limit}:{excess}" for ground, limit in GROUNDS for excess in (0, 2, 4)]
-ASKED = (1, 2, 3, 5, 15)
-"""Numbers of the missions whose plans are evaluated."""
-
-
-def world_of(name, data):
-    """Make the world with the assumed slope limit, and the simulator with the true limit."""
-    ground, limit, excess = name.split(":")
-    assumed, team = (climbing(float(limit) + more) for more in (float(excess), 0.0))
-    world = World(name, "slopes", ground, team=assumed, data=data)
-    simulator = KinematicSimulator(world.workspace(), terrain=world.true_terrain(), team=team)
-    return world, simulator
-
-
-def climbing(degrees):
-    """Make a team of robots with this slope limit in degrees."""
-    robot = tb.Robot(max_slope=float(np.deg2rad(degrees)))
-    return tb.Team(robots=(robot,) * 3, lead=robot)
-
-
-def judged_plans(world, simulator, course, seed, given):
-    """Compute predicted arrival probabilities of plans, and the fraction of runs that arrive."""
-    campaign, gathered = tb.Campaign(
-        simulator.workspace, *world.ends(course), sampler="importance", seed=seed
-    ), []  # fmt: skip
-    for number in range(1, max(ASKED) + 1):
-        plan = campaign.ask()
-        if number in ASKED:
-            runs = [simulator.run(plan.path, seed=20_000 + run) for run in range(given.runs)]
-            gathered.append(
-                {
-                    "mission": number,
-                    "p_arrive": plan.p_arrive,
-                    "product": float(np.prod(1.0 - plan.p_fail)),
-                    "arrived": float(np.mean([run.status == "ok" for run in runs])),
-                    "k_hat": campaign.hazard.attrs["k_hat"],
-                    "seconds": campaign.hazard.attrs["seconds"],
-                }
-            )
-        if number < max(ASKED):
-            mission = simulator.run(plan.path, seed=campaign.state.seed_of("mission"))
-            campaign.tell(mission, again=True)  # robots may get stuck in the same way twice
-    return gathered
-
-
-def judge_course(name, course, given):
-    """Return the evaluated plans of a course, keyed by seed; run campaigns without a file."""
-    warnings.simplefilter("ignore")
-    folder, gathered, built = Path(given.out) / "reliability", {}, None
-    folder.mkdir(parents=True, exist_ok=True)
-    for seed in range(given.seeds):
-        file = folder / f"{name.replace(':', '_')}_{course}_{seed}.json"
-        if not file.exists():
-            built = built or world_of(name, given.data)
-            rows = judged_plans(*built, course, seed, given)
-            file.write_text(json.dumps(rows) + "\n")
-        gathered[seed] = json.loads(file.read_text())
-    return gathered
-
-
-def reliability(names, given):
-    """Return the evaluated plans of all campaigns, keyed by world and course."""
-    tasks = [(name, course) for name in names for course in given.courses]
-    if given.jobs == 1:
-        return {task: judge_course(*task, given) for task in tasks}
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(given.jobs, mp_context=context) as pool:
-        jobs = {task: pool.submit(judge_course, *task, given) for task in tasks}
-        return {task: job.result() for task, job in jobs.items()}
-
-
-def print_reliability(gathered):
-    """Print means by mission and excess, with 95 % bootstrap intervals over worlds and courses."""
-    rng, judged = np.random.default_rng(0), []
-    for (name, _), campaigns in gathered.items():
-        rows = np.array(
-            [
-                [[row[k] for k in ("p_arrive", "product", "arrived")] for row in one]
-                for one in campaigns.values()
-            ]
-        )
-        p, product, arrived = np.moveaxis(rows, -1, 0)  # each (seed, mission)
-        brier = (p - arrived) ** 2 + arrived * (1.0 - arrived)
-        means = np.stack([p, product, arrived, p - arrived, brier]).mean(1)
-        judged.append((name.split(":")[2], means))
-    print()
-    head = "excess", "mission", "predicted", "product", "arrived", "predicted - arrived", "Brier"
-    table = Table(*head)
-    for excess in dict.fromkeys(which for which, _ in judged):
-        own = np.array([means for which, means in judged if which == excess])
-        if not len(own):
-            continue
-        again = own[rng.integers(len(own), size=(2000, len(own)))].mean(1)
-        low, high = np.quantile(again, [0.025, 0.975], axis=0)
-        for k, mission in enumerate(ASKED):
-            cells = [
-                f"{own.mean(0)[i, k]:.3f} ({low[i, k]:.3f} to {high[i, k]:.3f})" for i in range(5)
-            ]
-            table.row(excess, mission, *cells)
-    rows = [row for seeds in gathered.values() for one in seeds.values() for row in one]
-    k_hat, seconds = (max(row[name] for row in rows) for name in ("k_hat", "seconds"))
-    refused = np.mean([row["k_hat"] > 0.7 for row in rows])
-    print(f"\nlargest k-hat {k_hat:.2f}, refused {refused:.1%}; slowest fit {seconds:.2f} s")
-
-
 PRIORS = {
-    "N(1, 4²)": Hazard(margin=(1.0, 4.0), doubt=(0.0, 4.0)),
-    "N(0, .5²), N(0, 4²)": Hazard(),
+    "N(1, 4²)": Hazard(margin=(1.0, 4.0), limit="measured"),
+    "default": Hazard(),
 }
 """Priors of the margin: the prior of version 0.3, and the default."""
 
@@ -267,27 +147,14 @@ def area_under(tilt, passed):
 
 def main():
     parser = arguments(
-        __doc__, names=["reliability", "separation", "price"], data=True, seeds=3,
-        out="out/failures",
-        quick="one course, one seed and ten runs per plan",
+        __doc__, names=["separation", "price"], data=True, quick="one world"
     )  # fmt: skip
-    parser.add_argument("--worlds", nargs="*", default=WORLDS)
-    parser.add_argument("--courses", nargs="*", default=COURSES, choices=COURSES)
-    parser.add_argument("--runs", type=int, default=50, help="runs per plan (part reliability)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes (part reliability)")
     given = parsed(parser)
     warnings.simplefilter("ignore")
-    if given.quick:
-        given.out, given.courses = f"{given.out}-quick", given.courses[:1]
-        given.seeds, given.runs = 1, 10
-    Path(given.out).mkdir(parents=True, exist_ok=True)
-    names = [n for n in given.worlds if given.data or n.startswith("synthetic")]
     if "price" in given.names:
         print_price()
     if "separation" in given.names:
         print_separation(given)
-    if "reliability" in given.names:
-        print_reliability(reliability(names, given))
 
 
 if __name__ == "__main__":

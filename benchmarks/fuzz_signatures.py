@@ -328,7 +328,7 @@ def of_models() -> list[Call]:
         "intercept": (-7.5, 1.5),
         "coefficient": (2.0, 2.0),
         "margin": (0.0, 0.5),
-        "doubt": (0.1, 4.0),
+        "limit": (0.1, 4.0),
         "log_width": (0.0, 0.5),
         "log_strength": (-0.5, 1.0),
     }

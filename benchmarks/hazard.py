@@ -22,7 +22,7 @@ from trustbo.hazard.model import sample
 from trustbo.hazard.trials import Trials
 
 MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
-PRIORS = {"mixture (default)": Hazard(), "N(1, 4^2)": Hazard(margin=(1.0, 4.0), doubt=(0.0, 4.0))}
+PRIORS = {"mixture (default)": Hazard(), "N(1, 4^2)": Hazard(margin=(1.0, 4.0), limit="measured")}
 LIMIT, N_BOUNDS, MOVES = np.deg2rad(22.0), 80, 8
 
 

@@ -189,7 +189,7 @@ def _best(truth: Truth, course: Course) -> tuple[Cell, ...]:
 def with_price(planner: Planner, from_start: bool) -> Planner:
     """Make a failure cost the bounds of a shortest path; if not `from_start`, after the first."""
     risk = planner.problem.risk
-    has_failures = isinstance(risk, BoundRisk) and risk.has_failures
+    has_failures = isinstance(risk, BoundRisk) and bool(risk.failures.any())
     shortest = planner.problem.paths.shortest
     return planner.with_failure_cost(float(shortest) if from_start or has_failures else 0.0)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import trustbo as tb
+from trustbo.hazard import Hazard
 from trustbo.hazard.components import partition
 from trustbo.hazard.given import GivenRisk
 from trustbo.hazard.model import fit_hazard
@@ -50,7 +51,8 @@ def risk(workspace):
     """Risk after a failure, and a path."""
     path = [(4, 0), (3, 1), (2, 2), (1, 3), (0, 4)]
     lost = [LostMission(((4, 0), (3, 0), (2, 0)))]
-    return BoundRisk(fit_hazard([], workspace, lost=lost), workspace), path
+    prior = Hazard(limit=(0.1, 4.0), log_width=(-1.2, 0.5))
+    return BoundRisk(fit_hazard([], workspace, prior, lost=lost), workspace), path
 
 
 def test_mean_over_strata_is_that_over_all_draws(risk):

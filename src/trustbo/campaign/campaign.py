@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
-from trustbo.campaign.choose import choose, warn_if_infeasible, warn_of_risk
+from trustbo.campaign.choose import choose, warn_if_infeasible
 from trustbo.campaign.course import Course
 from trustbo.campaign.earlier import earlier_missions
 from trustbo.campaign.folder import FolderStorage
@@ -42,7 +42,6 @@ from trustbo.errors import (
 )
 from trustbo.files import FilePath
 from trustbo.hazard import Hazard
-from trustbo.hazard.risk import BoundRisk
 from trustbo.hazard.trials import CAUSES
 from trustbo.inference.learner import Model, learner_from_record, learner_of
 from trustbo.planning import NoPathError, Plan, Planner
@@ -128,8 +127,9 @@ class Campaign(Recorder):
                 where that is finite, and the awareness of the workspace elsewhere. Plans always use
                 the awareness of the workspace.
             hazard: Priors of the probability that a bound fails; by default `Hazard()`.
-            planner: Further options of `planning.Planner`, such as `{"max_failure": 0.1}`. Failures
-                have no cost until the first one is recorded, unless `failure_cost` is given.
+            planner: Further options of `planning.Planner`, such as `{"max_failure": 0.1}`. A
+                failure costs as many bounds as a shortest path has, if the objective measures
+                contact; with `{"failure_cost": 0.0}`, it costs nothing.
             fit: Further options of `trustbo.fit`, such as `{"draws": 500}`.
             earlier: Results or campaigns whose missions are also data of this campaign, so that
                 their posterior is its prior. They may have other courses, terrains and teams.
@@ -185,7 +185,6 @@ class Campaign(Recorder):
         super().__init__(workspace, state, learner)
 
         self._progress = progress
-        self._has_warned_of_risk = False
         if state.earlier.missions:
             self._use_posterior()
             if self.state.why_not:
@@ -236,7 +235,7 @@ class Campaign(Recorder):
                 return asked
 
             plan = self._propose(course)
-            self._accept(plan, self.risk)
+            self._accept(plan)
             return plan
 
     def _propose(self, course: Course) -> Plan:
@@ -282,7 +281,7 @@ class Campaign(Recorder):
             self._learn()
             course = self._course(cells[0][:2], cells[-1][:2], robots, usual=None)
             plan = self._evaluated(cells, course)
-            self._accept(plan, self.risk)
+            self._accept(plan)
             return plan
 
     def replan(
@@ -333,18 +332,14 @@ class Campaign(Recorder):
             closed = require_bounds("blocked", blocked)
 
             base = self._base_of(Course.of(plan))
-            plan, risk = plan_rest(self, base, self.policy, plan, cell, so_far, closed)
-            self._accept(plan, risk)
+            plan = plan_rest(self, base, self.policy, plan, cell, so_far, closed)
+            self._accept(plan)
             return plan
 
-    def _accept(self, plan: Plan, risk: BoundRisk) -> None:
-        """Record a plan, which was made with this risk, as the next one to run."""
+    def _accept(self, plan: Plan) -> None:
+        """Record a plan as the next one to run."""
         self._record(asked=plan)
         warn_if_infeasible(plan)
-        if not self._has_warned_of_risk:  # once per campaign
-            options = self.state.settings["planner"]
-            planner = self.planner_of(Course.of(plan))
-            self._has_warned_of_risk = warn_of_risk(plan, risk, planner, options)
 
     def tell(self, mission: Mission, *, again: bool = False) -> xr.DataTree | None:
         """Record a mission and learn from it.

@@ -147,7 +147,7 @@ def plan_rest(
     cell: Cell,
     so_far: Mission | None,
     blocked: Sequence[Pair],
-) -> tuple[Plan, BoundRisk]:
+) -> Plan:
     """Plan the rest of a mission in progress; see `Campaign.replan` for the arguments and errors.
 
     Args:
@@ -160,7 +160,7 @@ def plan_rest(
         blocked: Further bounds that cannot be driven.
 
     Returns:
-        The plan of the whole mission, and the failure probabilities that it was made with.
+        The plan of the whole mission.
     """
     state = result.state
     driven = follow(result, plan, cell, so_far, blocked)
@@ -181,7 +181,7 @@ def plan_rest(
     whole = whole_plan(base.problem, driven, rest)
     if so_far is not None and not _is_completed(so_far):
         whole = replace(whole, abandoned=(*plan.abandoned, plan.stations))
-    return with_past_failures(whole, state, planner, so_far), risk
+    return with_past_failures(whole, state, planner, so_far)
 
 
 def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:

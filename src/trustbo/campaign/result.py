@@ -11,7 +11,7 @@ import rioxarray  # noqa: F401  (registers the .rio accessor)
 import xarray as xr
 
 from trustbo.campaign.cache import computed
-from trustbo.campaign.choose import informed_planner, instead_of_failure
+from trustbo.campaign.choose import informed_planner
 from trustbo.campaign.course import Course
 from trustbo.campaign.folder import FolderStorage, without_lost_posteriors
 from trustbo.campaign.learning import fitted_missions, learn_hazard
@@ -340,8 +340,8 @@ class Result(Summary):
     ) -> Plan:
         """Plan the best path under the mean of `belief`, regardless of the policy, without bands.
 
-        If no path satisfies `max_failure`, or the best one almost certainly fails, the safest path
-        is returned. The arguments are those of `plan`.
+        If no path satisfies `max_failure`, the safest path is returned. The arguments are those of
+        `plan`.
         """
         return self._recommended(self._shown(start, goal, robots))
 
@@ -350,10 +350,9 @@ class Result(Summary):
         belief = self._belief_of(course)
         mean = belief.mean()
         try:
-            plan = planner.plan(mean)
+            return planner.plan(mean)
         except InfeasibleError as error:
             return planner.evaluate(error.stations, mean)
-        return instead_of_failure(planner, plan, belief)
 
     def plan(
         self,

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from trustbo.errors import TrustboError, require_positive, require_tuple
+from trustbo.errors import TrustboError, require_choice, require_positive, require_tuple
 from trustbo.workspace.difficulty import TILT
 
 REFERENCE = 0.5
@@ -24,14 +24,23 @@ _FARTHEST = 40.0
 """Largest tabulated quantile of the margin, in sds of the wider normal."""
 _N_TABULATED = 4000
 """Number of tabulated quantiles of the margin."""
+LIMITS = {
+    "measured": (0.0, 3.0),
+    "data sheet": (0.4, 3.0),
+    "guessed": (0.7, 4.0),
+}
+"""Probability that a stated slope limit is wrong, and the sd of its error in that case, degrees.
+
+That of a data sheet is calibrated by the first plans of `benchmarks/arrivals.py`.
+"""
 
 
 @dataclass(frozen=True)
 class Hazard:
     """Priors on the probability that a bound ends the mission; normal priors are (mean, sd) pairs.
 
-    By default, the stated slope limit is accurate to within half a degree with probability .9, and
-    wrong by about 4 degrees with probability .1.
+    By default, the stated slope limit is accurate to within half a degree with probability .6, and
+    wrong by about 3 degrees with probability .4.
 
     Attributes:
         intercept: Prior on the logit of the mean failure probability at medium difficulty.
@@ -41,28 +50,30 @@ class Hazard:
         margin: Prior on the number of degrees by which the true slope limit is below the stated
             limit, if the stated limit is approximately correct. All bounds share the margin, so a
             failure on one bound makes failures on equally steep bounds more probable.
-        doubt: Probability that the stated limit is wrong, and the sd of the margin in that case, in
-            degrees. The prior on the margin is a mixture of two normals with the same mean. Use a
-            probability of 0 if the limit was measured.
-        log_width: Prior on the log of the limit's width in degrees, .3 by default. If the tilt
+        limit: How the slope limit of the team is known: `"measured"` on the robots, from a
+            `"data sheet"`, or `"guessed"`. Or the probability that it is wrong and the sd of the
+            margin in that case, in degrees; `LIMITS` has those of the words. The prior on the
+            margin is a mixture of two normals with the same mean.
+        log_width: Prior on the log of the limit's width in degrees, .14 by default. If the tilt
             increases by 4.4 widths, the failure probability increases from .1 to .9. Use a larger
             width if the tilt along the driven curve is less well known.
         log_strength: Prior on the log of the strength s, the number of observations that the prior
             mean of a bound is worth. If every bound fails either always or never, s is small.
 
     Raises:
-        TrustboError: If an sd is not positive, or if the probability in `doubt` is outside [0, 1).
+        TrustboError: If an sd is not positive, or if the probability in `limit` is outside [0, 1),
+            or if `limit` is an unknown word.
 
     Example:
-        >>> measured = tb.hazard.Hazard(doubt=(0.0, 4.0))  # the slope limit was measured
+        >>> measured = tb.hazard.Hazard(limit="measured")
         >>> campaign = tb.Campaign(workspace, (9, 0), (0, 9), hazard=measured)
     """
 
     intercept: tuple[float, float] = (-7.5, 1.5)
     coefficient: tuple[float, float] = (2.0, 2.0)
     margin: tuple[float, float] = (0.0, 0.5)
-    doubt: tuple[float, float] = (0.1, 4.0)
-    log_width: tuple[float, float] = (-1.2, 0.5)
+    limit: str | tuple[float, float] = "data sheet"
+    log_width: tuple[float, float] = (-2.0, 0.5)
     log_strength: tuple[float, float] = (-0.5, 1.0)
 
     def __post_init__(self) -> None:
@@ -70,11 +81,22 @@ class Hazard:
             mean, sd = require_tuple(f"Hazard.{name}", getattr(self, name), 2)
             object.__setattr__(self, name, (mean, require_positive(f"sd of {name}", sd)))
 
-        share, sd = require_tuple("Hazard.doubt", self.doubt, 2)
-        share = require_positive("the probability of doubt", share, or_zero=True)
-        if share >= 1.0:
-            raise TrustboError(f"the probability of doubt must be in [0, 1); got {share!r}.")
-        object.__setattr__(self, "doubt", (share, require_positive("sd of doubt", sd)))
+        if isinstance(self.limit, str):
+            require_choice("Hazard.limit", self.limit, LIMITS)
+        else:
+            share, sd = require_tuple("Hazard.limit", self.limit, 2)
+            share = require_positive("the probability of a wrong limit", share, or_zero=True)
+            if share >= 1.0:
+                raise TrustboError(
+                    f"the probability of a wrong limit must be in [0, 1); got {share!r}."
+                )
+            sd = require_positive("sd of a wrong limit", sd)
+            object.__setattr__(self, "limit", (share, sd))
+
+    @property
+    def doubt(self) -> tuple[float, float]:
+        """Probability that the stated slope limit is wrong, and the sd in that case, degrees."""
+        return LIMITS[self.limit] if isinstance(self.limit, str) else self.limit
 
     def of_bounds(
         self, difficulty: np.ndarray, measures: Sequence[str], max_slope: float

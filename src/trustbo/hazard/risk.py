@@ -183,43 +183,17 @@ class BoundRisk(Risk):
             mean[units] = (a / (a + b)).mean(0)
         return self._maps(mean)
 
-    @property
-    def has_failures(self) -> bool:
-        """Whether any failure was recorded, at a known or unknown bound."""
-        return bool(self.failures.any()) or len(self._lost) > 0
-
     @cached_property
     def past_failures(self) -> np.ndarray:
-        """Posterior mean of the number of past failures, shape (way, row, col, next_way).
+        """Posterior mean of the number of past failures of each bound, shape (move, row, col).
 
-        Next ways, and sets of posts, with the same steepest route share their failures.
+        Failures with all next moves and all sets of posts are counted.
         """
         counts = self.failures.copy()
         for j, path in enumerate(self._lost):
             for k, bound in enumerate(path, start=1):
                 counts[*bound] += (self._place[:, j] == k).mean()
-
-        counts = by_option(counts)
-        stopped = np.zeros(counts.shape)
-        bounds = np.argwhere(counts.any(-1))
-        unit = self._difficulty.of(bounds).unit
-        same = (unit[..., None] == unit[:, None, :]) & (unit >= 0)[..., None]
-        stopped[*bounds.T] = np.where(same, counts[*bounds.T][:, None, :], 0.0).sum(-1)
-        return by_way(stopped, self._n_posts)
-
-    @cached_property
-    def past_failures_of_bounds(self) -> np.ndarray:
-        """Posterior mean of the number of past failures of each bound, shape (move, row, col).
-
-        With several sets of posts, a bound counts the failures with all of them.
-        """
-        failures = by_option(self.past_failures)
-        bounds = np.argwhere(failures.any(-1))
-        unit = self._difficulty.of(bounds).unit
-        is_first = unit == np.arange(unit.shape[-1])
-        stopped = np.zeros(failures.shape[:-1])
-        stopped[*bounds.T] = np.where(is_first, failures[*bounds.T], 0.0).sum(-1)
-        return stopped
+        return by_option(counts).sum(-1)
 
     def draw(self, n: int, seed: int = 0) -> np.ndarray:
         """Draw the failure probabilities, shape (draw, way, row, col, next_way).

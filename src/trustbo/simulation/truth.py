@@ -147,6 +147,14 @@ class Truth(Summary):
         contact, passed = self._along(path)
         return float((1.0 - np.cumprod(passed) * contact).sum())
 
+    def p_arrive(self, path: Sequence[Station]) -> float:
+        """Compute the probability that all bounds of a path are completed.
+
+        Raises the same errors as `lost`.
+        """
+        _, passed = self._along(path)
+        return float(passed.prod())
+
     def best(
         self,
         start: Location,
