@@ -45,8 +45,6 @@ CASES: dict[str, tuple[Hazard, bool]] = {
     "0.6, failures are free": (BEFORE, False),
 }
 """Prior of the hazard, and whether a failure costs the bounds of a shortest path."""
-N_DRAWS = 250
-"""Number of draws of the trust parameters, whose mean plans use."""
 _BINS = (0.0, 0.6, 0.75, 0.85, 0.9, 0.95, 0.98, 1.0)
 """Bins of predicted arrivals in the reliability curve."""
 _DECIMALS = 5
@@ -59,7 +57,7 @@ def run_world(world: World, truths: Path | None) -> list[dict[str, Any]]:
         ground = ground_of(world, truths)
         workspace, truth = ground.workspace, ground.truth.at(0)
         campaign = tb.Campaign(workspace, planner=PLANNER, progress=False)
-        draws = campaign.draw_prior(N_DRAWS).mean()
+        belief = campaign.belief.mean()
         risks = {
             name: BoundRisk(fit_hazard([], workspace, hazard), workspace)
             for name, (hazard, _) in CASES.items()
@@ -74,7 +72,7 @@ def run_world(world: World, truths: Path | None) -> list[dict[str, Any]]:
                 free = tb.Planner(workspace, *ends, failure_cost=0.0, **PLANNER)
                 for name, risk in risks.items():
                     priced = CASES[name][1]
-                    plan = (planner if priced else free).with_risk(risk).plan(draws)
+                    plan = (planner if priced else free).with_risk(risk).plan(belief)
                     rows.append({
                         **labels, "set": which, "course": number, "prior": name,
                         "predicted": plan.p_arrive, "arrives": truth.p_arrive(plan.path),
