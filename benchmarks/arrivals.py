@@ -69,7 +69,7 @@ def run_world(world: World, truths: Path | None) -> list[dict[str, Any]]:
             for number, ends in enumerate(courses(ground, which, COURSES)):
                 best = truth.best(*ends, max_bounds=PLANNER["max_bounds"], failures=True)
                 planner = tb.Planner(workspace, *ends, **PLANNER)
-                free = tb.Planner(workspace, *ends, failure_cost=0.0, **PLANNER)
+                free = planner.with_failure_cost(0.0)
                 for name, risk in risks.items():
                     priced = CASES[name][1]
                     plan = (planner if priced else free).with_risk(risk).plan(belief)

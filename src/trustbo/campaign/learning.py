@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -254,7 +254,7 @@ def _parts(mission: Mission, planned: Planned) -> list[Mission]:
 
         part = _some_bounds(mission, first, failed + 1, mission.statuses[failed])
         rest = (*mission.stations[first : failed + 1], *path[failed + 1 :])
-        parts.append(replace(part, path=rest, post_sets=()))
+        parts.append(_on(part, rest))
 
         first = failed + 1
         is_back = mission.path[first + 1 : first + 2] == (cells[failed],)
@@ -274,10 +274,15 @@ def _failed(mission: Mission, k: int) -> bool:
     return k < len(mission.statuses) and mission.statuses[k] != "ok"
 
 
+def _on(mission: Mission, stations: Sequence[Station], **fields: Any) -> Mission:
+    """Return a mission on another path, whose sets of posts are those of the stations."""
+    return replace(mission, path=stations, post_sets=(), **fields)
+
+
 def _some_bounds(mission: Mission, begin: int, end: int, status: str) -> Mission:
     """Return some bounds of a mission, with the cells that the mission has planned after them."""
     of_bounds = {name: getattr(mission, name)[begin:end] for name in OF_BOUNDS}
-    return replace(mission, path=mission.stations[begin:], post_sets=(), status=status, **of_bounds)
+    return _on(mission, mission.stations[begin:], status=status, **of_bounds)
 
 
 def _with_planned_path(mission: Mission, path: Sequence[Station]) -> Mission:
@@ -290,4 +295,4 @@ def _with_planned_path(mission: Mission, path: Sequence[Station]) -> Mission:
     is_begun = all(a[:2] == b for a, b in zip(path, mission.path, strict=False))
     if mission.status == "ok" or len(path) <= n or not is_begun:
         return mission
-    return replace(mission, path=(*mission.stations[:-1], *path[n - 1 :]), post_sets=())
+    return _on(mission, (*mission.stations[:-1], *path[n - 1 :]))

@@ -22,7 +22,7 @@ from trustbo.data import (
 from trustbo.display import Rows, Summary, joined
 from trustbo.hazard.path_risk import PathRisk
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import cells_along
+from trustbo.workspace.moves import cells_along, posts_along
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
 """Quantile levels of `Plan.bands`: the ends of the 90 % and the 50 % bands."""
@@ -182,8 +182,7 @@ class Plan(Summary):
         table = pd.DataFrame(places, columns=["x", "y"]).rename_axis("bound")
         table.insert(0, "cell", [path_text([cell]) for cell in self.path])
         if self.workspace.n_posts > 1:
-            standard = POST_SETS[:1] * (len(self.path) - 1)
-            table["posts"] = [*(self.post_sets or standard), ""]
+            table["posts"] = [*map(POST_SETS.__getitem__, posts_along(self.stations)), ""]
         return table.join(pd.DataFrame(of_bounds, index=table.index[1:]))
 
     def _trust_columns(self, name: str, robots: slice) -> dict[str, np.ndarray]:
