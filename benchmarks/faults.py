@@ -108,7 +108,7 @@ FAULTS = (
     Fault("the sign of an index is not the declared one", "terrain/composite.py",
           "np.sign(first @ signs[varies]) or 1.0", "np.sign(first.sum()) or 1.0"),
     Fault("the truth's best path ends on the last bound but one", "simulation/truth.py",
-          "last = (passed * contact)[:, *goal, END]", "last = (passed * contact)[:, *goal, 0]"),
+          "last = (passed * contact)[:, *goal, n_ways]", "last = (passed * contact)[:, *goal, 0]"),
     Fault("a fit takes the seeds of the policy", "campaign/learning.py",
           "seed=state.seed_of_fit", 'seed=state.seed_of("policy")'),
     Fault("a mission is learned from before it is on disk", "campaign/campaign.py",

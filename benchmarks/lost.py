@@ -41,6 +41,7 @@ from summary import bootstrap
 from world_set import World, worlds
 
 import trustbo as tb
+from trustbo.data import POST_SETS
 
 PLANNER = {"max_bounds": "shortest+4"}
 METHODS: dict[str, dict[str, Any]] = {
@@ -52,10 +53,9 @@ METHODS: dict[str, dict[str, Any]] = {
         "model": tb.models.PooledTrust(),
     },
     "line of sight": {"policy": line_of_sight.LineOfSight(), "model": tb.models.PooledTrust()},
-    "2 sets of posts": {"n_posts": 2},
-    "3 sets of posts": {"n_posts": 3},
+    "one set of posts": {"n_posts": 1},
 }
-"""Arguments of `trustbo.iterate`, and `n_posts` of the workspace, keyed by method."""
+"""Arguments of `trustbo.iterate`, and `n_posts` of the workspace, by default 3, keyed by method."""
 USUAL = (OURS, "running mean", "residual process", "line of sight")
 """Methods that are compared if none is given."""
 COURSES = ("sw-ne", "nw-se")
@@ -132,7 +132,7 @@ def rows_of(
 def campaign_of(world: World, course: str, method: str, n_missions: int) -> tb.Campaign:
     """Run a campaign of a method; baselines learn from each mission."""
     options = {"planner": PLANNER, **copy.deepcopy(METHODS[method])}  # policies learn
-    workspace = world.workspace(n_posts=options.pop("n_posts", 1))
+    workspace = world.workspace(n_posts=options.pop("n_posts", len(POST_SETS)))
     campaign = tb.Campaign(workspace, *world.ends(course), seed=4, progress=False, **options)
     for _, mission in campaign.run(world.simulator(workspace), n_missions, progress=False):
         if isinstance(campaign.policy, PathPolicy):

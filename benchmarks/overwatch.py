@@ -101,7 +101,7 @@ def contact_of(
     for replicate in range(N_REPLICATES):
         rng = np.random.default_rng([replicate, number])
         [(drive, contact, _)] = simulator.outcomes(
-            world, state, 1, after, [None], rng, expected=True
+            world, state, 1, [(after, None)], rng, expected=True
         )
         if drive.status == "ok":
             found.append(contact.mean())

@@ -14,7 +14,10 @@ count as lost.
 All methods pay the same for failures: a failure costs as many bounds as the shortest path of the
 course has, times the failure probability by `fit_hazard` on the missions so far. In the methods
 named `priced`, this is so from the first mission on. In those named `free first`, failures have no
-cost until one has happened. The baselines do not use a posterior of trust, and none is fitted. The
+cost until one has happened. `trustbo, three sets` also has the price from the first mission on, and
+plans with three sets of posts, the default of workspaces; all others have the standard set. Truths
+are those of the standard set, so three sets are compared by the contact lost as missions measure
+it. The baselines do not use a posterior of trust, and none is fitted. The
 residual process and the running mean plan with their means.
 
 Each campaign has a file in --out, so a run that was stopped continues where it was. With `--rows`,
@@ -27,6 +30,7 @@ import warnings
 from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -37,13 +41,13 @@ from baselines.paths import PathPolicy
 from common import Table, arguments, parsed, verdict
 from groups import GROUPS, KINDS, clustered, grounds_of, interval
 from joblib import Parallel, delayed, parallel_config
-from lost import lost_in
+from lost import LEAST, lost_in
 from threadpoolctl import threadpool_limits
 from world_set import World, worlds
 from world_set.world import drawn
 
 import trustbo as tb
-from trustbo.data import Cell, Mission
+from trustbo.data import POST_SETS, Cell, Mission
 from trustbo.errors import PosteriorError, TrustboError
 from trustbo.files import write_text
 from trustbo.hazard import BoundRisk, fit_hazard
@@ -77,10 +81,12 @@ class Priced:
     Attributes:
         policy: Name of the policy that chooses the path.
         from_start: Whether failures have a cost before the first one has happened.
+        n_posts: Number of sets of posts.
     """
 
     policy: str
     from_start: bool
+    n_posts: int = 1
 
     def __call__(
         self,
@@ -111,6 +117,7 @@ METHODS: dict[str, Priced | Baseline] = {
     "trustbo, free first": Priced("greedy", from_start=False),
     "trustbo, priced": Priced("greedy", from_start=True),
     "trustbo, explore": Priced("explore", from_start=True),
+    "trustbo, three sets": Priced("greedy", from_start=True, n_posts=3),
     "running mean, free first": Baseline(running_mean.greedy, from_start=False),
     "running mean, priced": Baseline(running_mean.greedy, from_start=True),
     "residual process, free first": Baseline(residual_process.ResidualProcess, from_start=False),
@@ -120,6 +127,13 @@ METHODS: dict[str, Priced | Baseline] = {
 }
 BASELINES = tuple(name for name, method in METHODS.items() if isinstance(method, Baseline))
 OURS = tuple(name for name, method in METHODS.items() if isinstance(method, Priced))
+PAIRS = (
+    ("explore minus greedy: excess in bounds per mission", "excess",
+     ("trustbo, explore", "trustbo, priced")),
+    ("three sets of posts minus one: contact lost in bounds per mission, as measured", "lost",
+     ("trustbo, three sets", "trustbo, priced")),
+)  # fmt: skip
+"""Titles, quantities and pairs of methods that are compared with each other."""
 RIGHT = "all but wrong slope limits"
 """Group for which the target is stated."""
 TARGET, LEVEL, WORSE = -0.04, 0.02, 0.01
@@ -131,17 +145,29 @@ TARGET, LEVEL, WORSE = -0.04, 0.02, 0.01
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """World in which campaigns run: its workspace, its simulator and their truth."""
+    """World in which campaigns run, with one set of posts, and its truth."""
 
     world: World
     workspace: Workspace
     simulator: KinematicSimulator | RadioSimulator
     truth: Truth
 
+    @cached_property
+    def with_sets(self) -> tuple[Workspace, KinematicSimulator | RadioSimulator]:
+        """Workspace and simulator of the world with three sets of posts."""
+        workspace = self.world.workspace(n_posts=len(POST_SETS))
+        return workspace, self.world.simulator(workspace)
+
+    def of(self, method: "Priced | Baseline") -> tuple[Workspace, Any]:
+        """Return the workspace and the simulator of a method."""
+        if isinstance(method, Priced) and method.n_posts > 1:
+            return self.with_sets
+        return self.workspace, self.simulator
+
 
 def ground_of(world: World, truths: Path | None) -> Ground:
     """Make the workspace, simulator and truth of a world; `truths` is the folder of truths."""
-    workspace = world.workspace(n_posts=1)  # truths do not know other sets of posts
+    workspace = world.workspace(n_posts=1)
     simulator = world.simulator(workspace)
     truth = Truth.from_simulator(simulator, folder=truths)
     return Ground(world, workspace, simulator, truth)
@@ -201,6 +227,7 @@ def seed_of(which: int, mission: int) -> int:
 def campaign_of(ground: Ground, which: int, name: str, on: Sequence[Course]) -> pd.DataFrame:
     """Run a campaign of a method on the courses `on` of a set; return a row for each mission."""
     method = METHODS[name]
+    _, simulator = ground.of(method)
     begin = _trustbo if isinstance(method, Priced) else _baseline
     proposals = begin(ground, which, method)
     next(proposals)
@@ -208,29 +235,30 @@ def campaign_of(ground: Ground, which: int, name: str, on: Sequence[Course]) -> 
     rows = []
     for k, course in enumerate(on):
         path, p_arrive = proposals.send(course)
-        mission = ground.simulator.run(path, seed=seed_of(which, k), mission=k)
+        mission = simulator.run(path, seed=seed_of(which, k), mission=k)
         proposals.send(mission)
 
         truth = ground.truth.at(k)
         best = truth.lost_or_failed(_best(truth, course))
+        is_known = not mission.post_sets  # the truth is that of the standard set
         rows.append({
             "world": ground.world.name, "kind": ground.world.kind, "case": ground.world.case,
             "set": which, "method": name, "mission": k + 1,
             "lost": lost_in(mission), "status": mission.status,
-            "excess": truth.lost_or_failed(path) - best, "best": best, "p_arrive": p_arrive,
+            "excess": truth.lost_or_failed(path) - best if is_known else np.nan,
+            "best": best, "p_arrive": p_arrive,
         })  # fmt: skip
     return pd.DataFrame(rows).round(_DECIMALS)
 
 
 def _trustbo(ground: Ground, which: int, method: Priced) -> Iterator:
     """Run a campaign of trustbo: send a course to get its path, then the mission on this path."""
-    campaign = tb.Campaign(
-        ground.workspace, policy=method, planner=PLANNER, seed=which, progress=False
-    )
+    workspace, _ = ground.of(method)
+    campaign = tb.Campaign(workspace, policy=method, planner=PLANNER, seed=which, progress=False)
     course = yield
     while True:
         plan = _asked(campaign, course)
-        mission = yield plan.path, plan.p_arrive
+        mission = yield plan.stations, plan.p_arrive
         campaign.tell(mission, again=True)  # robots may get stuck in the same way twice
         course = yield
 
@@ -455,10 +483,10 @@ def report(means: pd.DataFrame) -> None:
         print(f"\n**{title}**\n")
         print_means(of_worlds(means, name), 2)
 
-    pair = ["trustbo, explore", "trustbo, priced"]
-    if present.issuperset(pair):
-        print("\n**explore minus greedy**: excess in bounds per mission\n")
-        print_pair(means[means["method"].isin(pair)], *pair)
+    for title, quantity, pair in PAIRS:
+        if present.issuperset(pair):
+            print(f"\n**{title}**\n")
+            print_pair(of_worlds(means[means["method"].isin(pair)], quantity), *pair)
 
 
 def print_means(table: pd.DataFrame, places: int = 3) -> None:
@@ -494,16 +522,24 @@ def print_targets(found: pd.DataFrame) -> None:
     print(f"No group worse by more than {WORSE}: {verdict(not worse)} {', '.join(worse)}")
 
 
-def print_pair(means: pd.DataFrame, ours: str, other: str) -> None:
-    """Print the mean differences of two methods by group and kind."""
-    printed = Table("group (worlds)", "difference [95 %]", "p")
-    table = of_worlds(means)
+def print_pair(table: pd.DataFrame, ours: str, other: str) -> None:
+    """Print the mean differences of two methods by group and kind, for a table of `of_worlds`.
+
+    The ratio is that of the geometric means over worlds.
+    """
+    printed = Table("group (worlds)", "difference [95 %]", "p", "ratio [95 %]", "p of ratio")
     for group, chosen in groups_of(table).items():
         some = table[chosen]
+        where = grounds_of(some["world"])
         less = (some[ours] - some[other]).to_numpy()
-        value, low, high, p = clustered(less, grounds_of(some["world"]))
-        row = pd.Series({"value": value, "low": low, "high": high})
-        printed.row(f"{group} ({len(some)})", interval(row, 3), f"{p:.2g}")
+        ratio = np.log((some[ours] + LEAST) / (some[other] + LEAST)).to_numpy()
+
+        texts = []
+        for values, scale in ((less, np.positive), (ratio, np.exp)):
+            *ends, p = clustered(values, where)
+            row = pd.Series(dict(zip(("value", "low", "high"), scale(ends), strict=True)))
+            texts += [interval(row, 3), f"{p:.2g}"]
+        printed.row(f"{group} ({len(some)})", *texts)
 
 
 def main() -> None:

@@ -60,7 +60,8 @@ def main(faster=10.0):
     workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10))
     campaign = tb.Campaign(workspace, (9, 0), (0, 9), sampler="importance")
     follower, robots = tb.Follower(campaign), workspace.team.names
-    driven = tb.simulation.KinematicSimulator(workspace).run(follower.path, seed=0)
+    simulator = tb.simulation.KinematicSimulator(workspace)
+    driven = simulator.run(follower.path, seed=0, post_sets=follower.post_sets)
     trust_map = campaign.trust_map.values
     for bound in driven.bounds:
         follower.begin(bound.t0)

@@ -177,7 +177,7 @@ def draw_lost(
 ) -> None:
     """Draw the expected contact lost on the path of each mission and on the best path."""
     truth = tb.simulation.Truth.from_simulator(simulator)
-    values = [truth.lost(mission.path) for mission in result.missions]
+    values = [truth.lost(mission.stations) for mission in result.missions]
     best = truth.lost(truth.best(START, GOAL))
     ax.plot(range(1, 1 + len(values)), values, "o-", color=colour, label=label)
     ax.axhline(best, color=colour, linestyle=":", label=f"{label}: best path")

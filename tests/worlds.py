@@ -42,7 +42,7 @@ def hillside(height=90.0, width=90.0):
 
 def unequal_robots(*, blocked=()):
     """A workspace of 3 rows and 4 columns; were two robots mixed up, a result would show it."""
-    workspace = Workspace.from_terrain(hillside(90.0, 120.0), (3, 4))
+    workspace = Workspace.from_terrain(hillside(90.0, 120.0), (3, 4), n_posts=1)
     passable = workspace.passable.copy()
     for cell in blocked:
         passable[cell] = False

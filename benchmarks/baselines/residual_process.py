@@ -92,5 +92,5 @@ def fitted(bounds: np.ndarray, errors: np.ndarray) -> GaussianProcessRegressor:
 
 def places(bounds: np.ndarray) -> np.ndarray:
     """Middle of bounds (bound, 3), in cells, and the sine and cosine of their direction."""
-    steps = np.array(MOVES)[bounds[:, 0]]
+    steps = np.array(MOVES)[bounds[:, 0] % len(MOVES)]
     return np.hstack([bounds[:, 1:] - 0.5 * steps, steps / np.linalg.norm(steps, axis=1)[:, None]])

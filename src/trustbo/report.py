@@ -139,7 +139,8 @@ def bounds_of(result: Result) -> pd.DataFrame:
 
     - `contact`: expected contact rate, mean of the robots.
     - `measured`: mean of the measured contact rates over missions and robots; NaN if there is none.
-    - `begun`: number of times that missions on this map began the bound, from the same cell.
+    - `begun`: number of times that missions on this map began the bound, from the same cell and
+      with the same set of posts.
 
     Missions that a user has excluded do not count.
     """

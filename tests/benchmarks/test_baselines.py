@@ -27,7 +27,7 @@ LEARNERS = [
 @pytest.fixture(scope="module")
 def workspace():
     terrain = tb.terrain.synthetic_terrain((80.0, 80.0), seed=3, relief=5.0)
-    return tb.Workspace.from_terrain(terrain, (4, 4))
+    return tb.Workspace.from_terrain(terrain, (4, 4), n_posts=1)
 
 
 @pytest.fixture(scope="module")

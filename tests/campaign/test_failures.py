@@ -268,8 +268,9 @@ def test_price_after_a_failure_is_joint_over_strata(steep):
 def test_limit_holds_without_a_price_and_warns_if_no_path_keeps_it(workspace, hills):
     campaign = begin(hills, planner={"max_failure": 0.5})
     plan = campaign.ask()
-    assert campaign.planner.problem.is_within_limit(plan.path)
-    assert plan.p_arrive == pytest.approx(campaign.planner.problem.risk.along(plan.path).p_arrive)
+    problem = campaign.planner.problem
+    assert problem.is_within_limit(plan.stations)
+    assert plan.p_arrive == pytest.approx(problem.risk.along(plan.stations).p_arrive)
     with pytest.warns(UserWarning, match="max_failure"):
         plan = begin(workspace, planner={"max_failure": 1e-6}).ask()
     assert plan.infeasible

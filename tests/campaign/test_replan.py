@@ -321,7 +321,8 @@ def test_a_bound_that_stopped_robots_is_not_planned_again_with_its_next_move(log
     """Its failure may depend on the next move, which a log that ends or turns back lacks."""
     robot = tb.Robot(max_slope=np.radians(25.0))
     terrain = tb.terrain.synthetic_terrain((150.0, 150.0), 1.0, seed=2)
-    hilly = tb.Workspace.from_terrain(terrain, (4, 4), tb.Team(robots=(robot, robot), lead=robot))
+    team = tb.Team(robots=(robot, robot), lead=robot)
+    hilly = tb.Workspace.from_terrain(terrain, (4, 4), team, n_posts=1)
     campaign = tb.Campaign(hilly, *ENDS)
     path = campaign.ask().path
     k = 3

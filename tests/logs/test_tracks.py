@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from worlds import hillside
 
 import trustbo as tb
 from trustbo.data import NOWHERE
@@ -591,3 +592,42 @@ def test_ticks_of_a_gap_in_which_a_robot_has_no_poses_are_not_counted(field):
     assert read_driven(field, poses, seen).contact_rate[:, 0].min() < 1.0
     kept = poses[~(poses.robot.eq("a") & poses.t.between(25.0, 35.0))]
     assert read_driven(field, kept, seen).contact_rate.min() == 1.0
+
+
+@pytest.fixture(scope="module")
+def ground_with_sets():
+    return tb.Workspace.from_terrain(hillside(), (3, 3))
+
+
+def test_tracks_show_at_the_posts_of_which_sets_the_robots_stood(ground_with_sets):
+    path, sets = ((2, 0), (1, 1), (1, 2), (0, 2)), ("far", "standard", "route")
+    simulator = tb.simulation.KinematicSimulator(ground_with_sets, tick=0.5)
+    mission = simulator.run(path, post_sets=sets, seed=1)
+    poses, detections = tables_of(mission, ground_with_sets.team.names)
+    options = {"path": path, "tick": 0.5}
+    [read] = tb.logs.read_tracks(poses, detections, ground_with_sets, **options)
+    assert read.post_sets == sets
+
+    named = {**options, "path": [(2, 0, "route"), (1, 1), (1, 2), (0, 2)]}
+    [told] = tb.logs.read_tracks(poses, detections, ground_with_sets, **named)
+    assert told.post_sets == ("route", "standard", "standard")
+
+    away = poses.assign(x=poses["x"] + 40.0 * (poses["robot"] == "r2"))
+    with pytest.warns(UserWarning, match="did not stand at their posts"):
+        [other] = tb.logs.read_tracks(away, detections, ground_with_sets, **options)
+    assert other.post_sets == ()
+
+
+def tables_of(mission, robots):
+    """Poses and detections of a simulated mission."""
+    poses, looks = [], []
+    members = "lead", *robots
+    for bound in mission.bounds:
+        times = np.linspace(bound.t0, bound.t1, len(bound.poses), endpoint=False) + 0.1
+        for t, places, seen in zip(times, bound.poses, bound.contact, strict=True):
+            poses += [(t, name, *xy[:2]) for name, xy in zip(members, places, strict=True)]
+            looks += [(t, name, "lead") for name, there in zip(robots, seen, strict=True) if there]
+    return (
+        pd.DataFrame(poses, columns=["t", "robot", "x", "y"]),
+        pd.DataFrame(looks, columns=["t", "watcher", "seen"]),
+    )

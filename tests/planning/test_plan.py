@@ -26,7 +26,7 @@ def plan(workspace):
 
 
 def assert_is_of_its_path(plan, workspace):
-    path = plan.path
+    path = plan.stations
     assert plan.posts.shape == (len(path) - 1, 2, 2)
     for k, (a, c) in enumerate(itertools.pairwise(path)):
         np.testing.assert_array_equal(plan.posts[k], workspace.posts.watching(a, c))

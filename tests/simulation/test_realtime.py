@@ -134,7 +134,7 @@ def test_a_campaign_learns_from_the_awareness_of_its_choice(simulator, missions,
     mapped, measured = run("map", 2), run("measured", 2, directory=tmp_path / "two")
     for result in (mapped, measured):
         for entry in result.state.entries:
-            of_map = simulator.workspace.along(entry.measured.path)
+            of_map = simulator.workspace.along(entry.measured.stations)
             expected = of_map if result is mapped else entry.measured.awareness
             np.testing.assert_array_equal(entry.mission.awareness, expected)
     given = measured.state.entries[0].measured.awareness

@@ -1,6 +1,7 @@
 """Truth: tables against missions, best paths against enumeration, files."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from disks import full_disk
 from enumeration import every_path
 from worlds import contact_along, hillside, random_cells
 
-from trustbo.data import Mission
+from trustbo.data import POST_SETS, Mission
 from trustbo.errors import TrustboError
 from trustbo.planning import NoPathError
 from trustbo.simulation import KinematicSimulator, Truth
@@ -24,6 +25,11 @@ PATH = ((2, 0), (1, 1), (1, 2), (0, 1))
 
 @pytest.fixture(scope="module")
 def wooded():
+    return KinematicSimulator(Workspace.from_terrain(hillside(), (3, 3), n_posts=1))
+
+
+@pytest.fixture(scope="module")
+def with_sets():
     return KinematicSimulator(Workspace.from_terrain(hillside(), (3, 3)))
 
 
@@ -39,14 +45,14 @@ def grid(shape=(3, 4), walls=()):
     return Workspace.from_awareness(np.full((1, *shape, 2), 0.5), passable)
 
 
-def made_up(workspace, rng, some_fail=True):
+def made_up(workspace, rng, some_fail=True, n_posts=1):
     """Truth with contact and probabilities to pass drawn at random."""
-    shape = 8, *workspace.passable.shape, 9
+    shape = 8 * n_posts, *workspace.passable.shape, 8 * n_posts + 1
     contact, passed = np.full(shape, np.nan), np.full(shape, np.nan)
-    for edge in edges_of(workspace):
-        for n in edge.next_moves:
-            contact[edge.move, *edge.cell, n] = rng.uniform()
-            passed[edge.move, *edge.cell, n] = rng.choice([0.0, 0.6, 1.0]) if some_fail else 1.0
+    for edge in edges_of(workspace, n_posts):
+        for n in edge.next_ways:
+            contact[edge.way, *edge.cell, n] = rng.uniform()
+            passed[edge.way, *edge.cell, n] = rng.choice([0.0, 0.6, 1.0]) if some_fail else 1.0
     return Truth(workspace, table_of(contact, passed))
 
 
@@ -58,6 +64,15 @@ def test_the_table_is_the_mean_of_many_missions(wooded, of_wooded):
     np.testing.assert_allclose(contact_along(of_wooded, PATH), rates, atol=0.02)
     assert of_wooded.lost(PATH) == pytest.approx(3.0 - rates.sum(), abs=0.03)
     assert of_wooded.lost_or_failed(PATH) == of_wooded.lost(PATH)
+
+
+def test_the_table_of_several_sets_is_the_mean_of_many_missions(with_sets):
+    truth = Truth.from_simulator(with_sets, n_replicates=4)
+    path = ((2, 0, "far"), (1, 1), (1, 2, "route"), (0, 1))
+    missions = [with_sets.run(path, seed=seed) for seed in range(200)]
+    lost = 3.0 - np.mean([mission.contact_rate for mission in missions], axis=(0, 2)).sum()
+    assert truth.lost(path) == pytest.approx(lost, abs=0.05)
+    assert truth.lost(path) != truth.lost(PATH)  # cells, whose set is the standard one
 
 
 def test_replicates_of_another_seed_agree(wooded, of_wooded):
@@ -205,6 +220,20 @@ def test_the_best_path_is_that_of_enumeration(max_bounds, failures):
             lacking = (truth.lost(admissible[0]) - truth.lost(best)) / kept
             regret = truth.regret(admissible[0], **options)
             assert regret == pytest.approx(100.0 * lacking)
+
+
+@pytest.mark.parametrize("failures", [False, True])
+def test_the_best_path_with_sets_is_that_of_enumeration(failures):
+    workspace, ends = grid((3, 3)), ((2, 0), (0, 2))
+    truth = made_up(workspace, np.random.default_rng(5), n_posts=2)
+    measure = truth.lost_or_failed if failures else truth.lost
+    best = truth.best(*ends, max_bounds=4, failures=failures)
+    every = [
+        [*zip(*zip(*path[:-1], strict=True), names, strict=True), path[-1]]
+        for path in every_path(workspace.passable_bounds.values, *ends, 4, u_turns=True)
+        for names in product(POST_SETS[:2], repeat=len(path) - 1)
+    ]
+    assert measure(best) == pytest.approx(min(map(measure, every)), rel=1e-12)
 
 
 def test_impossible_truths_are_refused():

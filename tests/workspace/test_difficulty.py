@@ -27,7 +27,8 @@ def behind_a_wall(gap):
     dem = np.zeros((60, 60))
     dem[:, 30] = 30.0
     dem[gap, 30] = 0.0
-    return tb.Workspace.from_terrain(terrain_of(dem), (3, 3), sight=tb.workspace.Sight(0.0))
+    terrain, opaque_ground = terrain_of(dem), tb.workspace.Sight(0.0)
+    return tb.Workspace.from_terrain(terrain, (3, 3), sight=opaque_ground, n_posts=1)
 
 
 def test_difficulty_is_that_of_the_largest_tilt_and_the_least_room():

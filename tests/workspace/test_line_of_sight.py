@@ -27,7 +27,7 @@ A, C, NEXT = (3, 0), (2, 1), (1, 2)
 @pytest.fixture(scope="module")
 def wooded():
     terrain = synthetic_terrain((160.0, 160.0), seed=5, relief=8.0)
-    return Workspace.from_terrain(terrain, (4, 4), Team(n_robots=2))
+    return Workspace.from_terrain(terrain, (4, 4), Team(n_robots=2), n_posts=1)
 
 
 def cell_at(workspace, position):
@@ -130,10 +130,10 @@ def test_line_of_sight_predicts_the_simulator_without_noise(name, real_terrain):
     rng, expected, simulated = np.random.default_rng(0), [], []
     for b in rng.permutation(len(index))[:60]:
         (m, row, col), (a, c) = index[b], pairs[b]
-        ahead = [n for p, n in pairs if p == c and n != a]
+        ahead = [(c, n) for p, n in pairs if p == c and n != a]
         world, state = simulator.world(), simulator.standing(a, c)
         rng_of_bound = np.random.default_rng(0)
-        found = simulator.outcomes(world, state, 1, c, ahead, rng_of_bound, expected=True)
+        found = simulator.outcomes(world, state, 1, ahead, rng_of_bound, expected=True)
         if any(drive.status != "ok" for drive, _, _ in found):
             continue
         simulated.append(np.mean([contact.mean() for _, contact, _ in found]))

@@ -8,7 +8,7 @@ from worlds import hillside
 
 import trustbo as tb
 from trustbo.data import POST_SETS
-from trustbo.simulation import KinematicSimulator, Truth
+from trustbo.simulation import KinematicSimulator
 from trustbo.workspace import MOVES
 from trustbo.workspace.line_of_sight import N_SAMPLES, Geometry, bound_features
 from trustbo.workspace.moves import bounds_along, pairs_along, way_names
@@ -21,7 +21,7 @@ ROUTE = ((2, 0, "far"), (1, 1), (1, 2, "route"), (0, 2))
 
 @pytest.fixture(scope="module")
 def workspace():
-    return tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=3)
+    return tb.Workspace.from_terrain(hillside(), (3, 3))
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def result(workspace):
 
 
 def test_the_standard_set_is_that_of_a_workspace_with_one_set(workspace):
-    one = tb.Workspace.from_terrain(hillside(), (3, 3))
+    one = tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=1)
     assert (one.n_posts, one.post_sets) == (1, ("standard",))
     assert workspace.post_sets == POST_SETS == tuple(SETS)
     assert workspace.awareness["move"].values.tolist() == way_names(4)
@@ -181,7 +181,8 @@ class Sets(Cells):
 def test_a_simulator_gets_sets_if_it_reads_them_and_otherwise_cells(workspace, result):
     options = {"n_iterations": 1, "seed": 1}
     cells, sets = Cells(workspace), Sets(workspace)
-    plain = tb.iterate(workspace, *ENDS, simulator=cells, **options)
+    with pytest.warns(UserWarning, match="n_posts=1"):
+        plain = tb.iterate(workspace, *ENDS, simulator=cells, **options)
     [mission] = plain.missions
     assert mission.post_sets == ()  # the standard posts, whatever was planned
     assert plain.table()["posts"].tolist() == [" ".join(result.missions[0].post_sets)]
@@ -240,7 +241,7 @@ def test_a_team_that_follows_a_plan_and_turns_off_has_the_standard_posts(workspa
     plan = campaign.ask()
     follower = tb.Follower(campaign)
     follower.begin(t=0.0, cell=plan.path[1])
-    assert follower.path == plan.path  # the planned cell, with the planned posts
+    assert (follower.path, follower.post_sets) == (plan.path, plan.post_sets)
     follower.tick(1.0, [True, True, False])
     follower.end(t=10.0, status="stuck")
     assert follower.to_mission().post_sets == plan.post_sets
@@ -269,8 +270,17 @@ def test_sets_that_a_workspace_does_not_offer_are_refused():
         tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=5)
     with pytest.raises(tb.TrustboError, match="n_posts > 1 needs line of sight"):
         tb.Workspace.from_terrain(hillside(), (3, 3), n_posts=2, bounds=False)
-    with pytest.raises(tb.TrustboError, match="from the standard posts only"):
-        Truth.from_simulator(KinematicSimulator(two)).lost(ROUTE[:2])
+
+
+def test_a_posterior_scores_sets_of_the_workspace_that_no_mission_used(workspace):
+    simulator = KinematicSimulator(workspace)
+    path = [(2, 0), (2, 1), (2, 2), (1, 2)]
+    driven = [simulator.run(path, post_sets=["far"] * 3, seed=seed) for seed in range(2)]
+    other = [simulator.run(path, post_sets=["route"] * 3, seed=2)]
+    known = tb.fit(driven, workspace=workspace)
+    assert np.isfinite(tb.inference.score(known, other)["log_score"].values).all()
+    with pytest.raises(tb.TrustboError, match="the posts 'route'"):
+        tb.inference.score(tb.fit(driven), other)
 
 
 def test_no_other_set_of_a_bound_makes_the_plan_better(workspace, result):
@@ -296,3 +306,33 @@ def test_a_graph_has_an_edge_for_each_set(workspace, result):
     assert set(graph[2, 0][1, 1]) == set(POST_SETS)
     least = min(edge["lost"] for edge in graph[2, 0][1, 1].values())
     assert least < graph[2, 0][1, 1]["standard"]["lost"] + 1e-12
+
+
+def test_the_explorer_shows_the_posts_of_plans_and_missions(result):
+    html = result.explore().html
+    other = {*result.plan().post_sets} - {POST_SETS[0]}
+    assert other
+    assert all(f"{name} posts" in html for name in other)
+
+
+def test_nav2_files_lead_to_the_posts_of_the_plan_and_cost_the_best_set(result, tmp_path):
+    tb.export.write_nav2(tmp_path, result)
+    plan = result.plan()
+    frame = tb.export.Frame(result.workspace.grid.center(plan.path[0]))
+    for i, robot in enumerate(result.workspace.team.names):
+        poses = json.loads((tmp_path / f"waypoints_{robot}.yaml").read_text())["poses"]
+        places = [[pose["pose"]["position"][axis] for axis in "xy"] for pose in poses]
+        found = frame.to_crs(places)[: len(plan.posts)]
+        np.testing.assert_allclose(found, plan.posts[:, i], atol=1e-6)
+
+    n_cols = result.workspace.grid.shape[1]
+    features = json.loads((tmp_path / "route_graph.geojson").read_text())["features"]
+    edges = [f["properties"] for f in features if "startid" in f["properties"]]
+    costs = {(edge["startid"], edge["endid"]): edge["cost"] for edge in edges}
+    assert len(costs) == len(edges)
+    a, c = plan.path[:2]
+    graph, price = result.planner.graph(result.posterior), result.planner.problem.cost_of_failure
+    p_fail = np.nanmean(result.risk.mean[bounds_along([a, c])[0][0] :: len(MOVES), *c], axis=-1)
+    losses = [graph[a][c][name]["lost"] for name in POST_SETS]
+    least = min(lost + price * p for lost, p in zip(losses, p_fail, strict=True))
+    assert costs[a[0] * n_cols + a[1], c[0] * n_cols + c[1]] == pytest.approx(least)

@@ -22,7 +22,7 @@ def test_a_workspace_of_a_terrain(terrain):
     team = Team(n_robots=2)
     workspace = Workspace.from_terrain(terrain, (4, 3), team)
     assert workspace.awareness.dims == ("robot", "move", "row", "col", "feature")
-    assert workspace.awareness.shape == (2, 8, 4, 3, 3)
+    assert workspace.awareness.shape == (2, 3 * 8, 4, 3, 3)
     assert workspace.features == ("traversability", "visibility", "line_of_sight")
     assert float(workspace.awareness.min()) >= 0.0
     assert float(workspace.awareness.max()) <= 1.0

@@ -9,7 +9,17 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.replan import trust_filter
-from trustbo.data import MEASURED, STATUSES, Bound, Cell, Mission, Station, cells_of, path_text
+from trustbo.data import (
+    MEASURED,
+    STATUSES,
+    Bound,
+    Cell,
+    Mission,
+    Station,
+    cells_of,
+    path_text,
+    split_path,
+)
 from trustbo.display import Rows, Summary
 from trustbo.errors import (
     TrustboError,
@@ -75,6 +85,11 @@ class Follower(Summary):
     def path(self) -> tuple[Cell, ...]:
         """Cells of the mission in order: the cells entered, followed by the planned ones."""
         return tuple(cells_of(self._stations))
+
+    @property
+    def post_sets(self) -> tuple[str, ...]:
+        """Name of the set of posts for each bound of `path`; empty if all are standard."""
+        return split_path(self._stations)[1]
 
     def _rows(self) -> Rows:
         here, *planned = self.rest

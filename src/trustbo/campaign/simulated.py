@@ -1,6 +1,5 @@
 """Missions of a campaign in a simulator."""
 
-import inspect
 import json
 from collections.abc import Callable, Generator, Sequence
 from typing import Any
@@ -11,11 +10,11 @@ from trustbo.campaign.stopping import Stop
 from trustbo.data import Cell, Mission
 from trustbo.display import bar as progress_bar
 from trustbo.display import refreshing
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, warn
 from trustbo.files import to_json
 from trustbo.planning import Plan
 from trustbo.simulation import KinematicSimulator, RealtimeAwareness
-from trustbo.simulation.protocol import Simulator
+from trustbo.simulation.protocol import Simulator, reads_post_sets
 
 
 def require_simulator(campaign: Result, simulator: Simulator | None) -> Simulator:
@@ -32,6 +31,14 @@ def require_simulator(campaign: Result, simulator: Simulator | None) -> Simulato
     if isinstance(simulator, type) or not callable(getattr(simulator, "run", None)):
         raise TrustboError(
             f"simulator needs a method run(path, *, seed, mission) -> Mission; got {simulator!r}."
+        )
+
+    if campaign.workspace.n_posts > 1 and not reads_post_sets(simulator):
+        warn(
+            "the simulator's robots always stand at their standard posts, because its method run "
+            "has no argument post_sets, but plans choose among "
+            f"{campaign.workspace.n_posts} sets of posts; add the argument, or make the workspace "
+            "with n_posts=1."
         )
     return simulator
 
@@ -78,8 +85,7 @@ def run_missions(
 
 def sets_for(simulator: Simulator, plan: Plan) -> dict[str, Sequence[str]]:
     """Return the argument `post_sets` for a simulator that has it, if not all are standard."""
-    reads = plan.post_sets and "post_sets" in inspect.signature(simulator.run).parameters
-    return {"post_sets": plan.post_sets} if reads else {}
+    return {"post_sets": plan.post_sets} if plan.post_sets and reads_post_sets(simulator) else {}
 
 
 def _reason_to_end(campaign: Result, n_iterations: int, stop: Stop | None) -> str | None:

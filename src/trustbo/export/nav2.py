@@ -390,16 +390,14 @@ def _graph(result: Result, frame: Frame) -> str:
         features.append(_feature("Point", xy, about))
 
     failure_cost = result.planner.problem.cost_of_failure
-    edges: dict[Any, dict[str, float]] = {}
-    for a, c, edge in graph.edges(data=True):  # of parallel edges, the one with the best posts
-        if (a, c) not in edges or edge["lost"] < edges[a, c]["lost"]:
-            edges[a, c] = edge
-
-    for (a, c), edge in edges.items():
-        move = MOVES.index((c[0] - a[0], c[1] - a[1]))
+    least: dict[Any, tuple[float, float]] = {}  # of parallel edges, the one with the best posts
+    for a, c, edge in graph.edges(data=True):
         p_fail = -math.expm1(-edge.get("risk", 0.0))
         cost = max(edge["lost"] + failure_cost * p_fail, _MIN_COST)
+        least[a, c] = min(least.get((a, c), (math.inf, 0.0)), (cost, p_fail))
 
+    for (a, c), (cost, p_fail) in least.items():
+        move = MOVES.index((c[0] - a[0], c[1] - a[1]))
         about = {"id": (1 + move) * n_cells + ids[c], "startid": ids[a], "endid": ids[c]}
         about |= {"cost": cost, "overridable": True}
         about |= {"metadata": {"penalty": cost, "p_fail": p_fail}}

@@ -20,8 +20,8 @@ from trustbo.workspace.moves import by_option, by_way, next_names, way_names
 
 _DIMS = ("draw", "lost", "measure", "bound", "axis", "move", "row", "col", "next_move")
 """Axes of the group `hazard`, in order."""
-_ENTRIES = 1 << 20
-"""Maximum size of an array (draw, bound)."""
+_ENTRIES = 1 << 17
+"""Maximum size of an array (draw, bound), which fits into the cache of a core."""
 _SOME = 256
 """Approximate number of bounds whose mean failure probability determines the order of the draws."""
 

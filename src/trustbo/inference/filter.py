@@ -282,7 +282,8 @@ class TrustFilter:
         """Return the ways, rows and columns (bound, 3) of a path; ways are -1 if not needed.
 
         Raises:
-            TrustboError: If the path is missing, has the wrong length, jumps or leaves the grid.
+            TrustboError: If the path is missing, has the wrong length, jumps, leaves the grid, or
+                has sets of posts that the posterior does not know.
         """
         grid = self.params.grid_shape
         if path is None and grid is None:
@@ -296,7 +297,16 @@ class TrustFilter:
             )
         if grid is not None:
             require_on_grid(cells, grid)
-        return bounds_along(cells)  # refuses a path that jumps
+
+        bounds = bounds_along(cells)  # refuses a path that jumps
+        n_ways = self.params.n_ways
+        if n_ways is not None and (bounds[:, 0] >= n_ways).any():
+            k = int(np.argmax(bounds[:, 0] >= n_ways))
+            raise TrustboError(
+                f"path[{k}] has the posts {cells[k][-1]!r}, which no mission of the fit has used; "
+                "give the workspace to fit, so that the posterior includes all its sets of posts."
+            )
+        return bounds
 
     def _of_robots(self, what: str, values: ArrayLike) -> np.ndarray:
         """Read values (robot,) by the names of the robots, if they are labelled."""

@@ -600,7 +600,8 @@ def with_prior_effects_ahead(
             "place_bound": np.zeros((1, n_draws, 0)),
             "place_robot": np.zeros((1, n_draws, 0, len(robots))),
         }
-        places = visited(np.full((1, 1, 3), -1), workspace.grid.shape)
+        nothing = np.full((1, 1, 3), -1)
+        places = visited(nothing, workspace.grid.shape, n_posts=workspace.n_posts)
         group = place_group(nowhere, places, robots, f_e=effect.f_e, seed=seed)
 
     sizes = {"mission": 0, "robot": len(robots)}
@@ -656,9 +657,11 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
             one = one.isel(bound=was_made)
             cells = zip(one["row"].values, one["col"].values, strict=True)
             path = [(int(one["start_row"]), int(one["start_col"])), *cells]
+            post_sets = [str(name) for name in one["posts"].values] if "posts" in one else ()
         else:  # a mission without a map
             one = one.isel(bound=slice(int(one["n_bounds"])))
             path = None
+            post_sets = ()
 
         mission = Mission.from_arrays(
             path,
@@ -669,6 +672,7 @@ def missions_of(posterior: xr.DataTree) -> list[Mission]:
             n_ticks=one["n_ticks"].values,
             robots=robots,
             features=features,
+            post_sets=post_sets,
         )
         if "map" in one:
             mission = replace(mission, map=str(one["map"].values))

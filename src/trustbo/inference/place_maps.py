@@ -87,7 +87,7 @@ def place_group(
     if places.bound_map.any():
         coords["cell_map"] = "cell", places.cell_map
         coords["bound_map"] = "bound", places.bound_map
-    attrs = {"shape": list(places.shape), "f_e": f_e, "seed": seed}
+    attrs = {"shape": list(places.shape), "n_posts": places.n_posts, "f_e": f_e, "seed": seed}
     return xr.Dataset(variables, coords, attrs)
 
 
@@ -174,11 +174,8 @@ def _sight(group: xr.Dataset, workspace: Workspace | None) -> np.ndarray:
     It is 0.5, where the scale is 1, if line of sight is not predicted.
     """
     rows, cols = (int(n) for n in group.attrs["shape"])
-    if workspace is None:
-        most = int(group["bound_move"].max()) if group.sizes["bound"] else 0
-        n_ways = len(MOVE_NAMES) * (1 + most // len(MOVE_NAMES))
-    else:
-        n_ways = workspace.awareness.sizes["move"]
+    n_posts = int(group.attrs["n_posts"]) if workspace is None else workspace.n_posts
+    n_ways = len(MOVE_NAMES) * n_posts
 
     sight = [] if workspace is None else [*filter(is_line_of_sight, workspace.features)]
     if workspace is None or not sight:

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from trustbo.arrays import evenly_spaced
-from trustbo.data import NOWHERE, Mission
+from trustbo.data import NOWHERE, POST_SETS, Mission
 from trustbo.display import slow_bar
 from trustbo.inference.latent import N_TRAJECTORIES, Source, latent_of, replicate
 from trustbo.inference.params import transposed
@@ -213,6 +213,12 @@ def _data_groups(
     # The number of bounds follows from the cells, except for missions without a map.
     if not all(mission.path for mission in missions):
         constant["n_bounds"] = ("mission", [len(mission.bounds) for mission in missions])
+    if any(mission.post_sets for mission in missions):
+        names = np.full(cell.shape[:2], "", dtype=object)
+        for own, mission in zip(names, missions, strict=True):
+            n_bounds = len(mission.bounds)
+            own[:n_bounds] = (mission.post_sets or POST_SETS[:1] * n_bounds)[:n_bounds]
+        constant["posts"] = (("mission", "bound"), names.astype(str))
     if any(mission.map for mission in missions):
         constant["map"] = ("mission", [mission.map for mission in missions])
 

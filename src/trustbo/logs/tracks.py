@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from trustbo.data import STATUSES, Mission, Station
+from trustbo.data import STATUSES, Mission, Station, cells_of, stations_of
 from trustbo.errors import TrustboError, require_choice, require_positive, warn
 from trustbo.logs.crossings import crossings_of
 from trustbo.logs.detections import (
@@ -91,8 +91,8 @@ def read_tracks(
         UserWarning: A watcher is unknown, detections lie outside the time of the poses, the lead
             detects robots, the interval of detections is not the tick, poses are more than 5 s
             apart, a robot has no poses, is never seen or never watches, the lead leaves the
-            planned path or starts again after it, or the path has no sets of posts although the
-            workspace has several.
+            planned path or starts again after it, or T2 stood at the posts of no set, although the
+            workspace has several and the path has none.
 
     Example:
         >>> missions = tb.logs.read_tracks("poses.csv", "detections.csv", window=20.0)
@@ -130,7 +130,7 @@ def read_tracks(
         of_name = places.loc[places["robot"] == name]
         if workspace is not None and len(of_name):
             cells, edges = crossings_of(of_name, n, tick, workspace.grid, path)
-            _warn_of_unnamed_posts(cells, workspace)
+            cells = _with_sets(cells, edges, places, workspace)
 
         of_lead = pairs.loc[pairs["lead"] == name]
         if len(edges) > 1 and len(of_lead):
@@ -171,13 +171,39 @@ def _leads(lead: str | None, robots: Sequence[str], workspace: Workspace | None)
     return leads
 
 
-def _warn_of_unnamed_posts(path: Sequence[Station], workspace: Workspace) -> None:
-    """Warn of a path without names of sets of posts in a workspace that has several."""
-    if workspace.n_posts > 1 and all(len(station) == 2 for station in path):
+def _with_sets(
+    path: Sequence[Station], edges: np.ndarray, places: pd.DataFrame, workspace: Workspace
+) -> Sequence[Station]:
+    """Return a path with the sets of posts at which T2 stood when the lead entered each cell.
+
+    A path that has names of sets keeps them. If T2 stood elsewhere, a warning is issued.
+
+    Args:
+        path: Planned or driven path.
+        edges: Ticks at which the lead entered each cell after the first one, and the end.
+        places: Poses with columns tick, robot, x and y.
+        workspace: Workspace, which may have several sets.
+    """
+    if workspace.n_posts == 1 or any(len(station) > 2 for station in path):
+        return path
+
+    cells = cells_of(path)
+    stood = np.full((len(cells) - 1, workspace.team.n_robots, 2), np.nan)
+    entered = edges[:-1]
+    by_robot = dict(iter(places.groupby("robot")))
+    for i, name in enumerate(workspace.team.names):
+        if name in by_robot:
+            track = by_robot[name].set_index("tick")[["x", "y"]]
+            stood[: len(entered), i] = track.reindex(entered).to_numpy()
+
+    try:
+        return stations_of(cells, workspace.post_sets_of(cells, stood))
+    except TrustboError:
         warn(
-            "the path has no sets of posts, so the subteam counts as being at the standard ones; "
-            "pass the stations of the plan as path, or post_sets=workspace.post_sets_of(path, ...)."
+            "some robots of the subteam did not stand at their posts of any set, so the subteam "
+            "counts as being at the standard posts; pass path=plan.stations to name the sets."
         )
+        return path
 
 
 def _pairs(places: pd.DataFrame, looks: pd.DataFrame) -> pd.DataFrame:

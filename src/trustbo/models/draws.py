@@ -168,6 +168,11 @@ class Draws(Summary):
         return self.own.shape if self.own is not None else None
 
     @property
+    def n_ways(self) -> int | None:
+        """Number of ways into a cell for which the inputs have effects; None without effects."""
+        return self.arrays["place_bound"].shape[-3] if "place_bound" in self.arrays else None
+
+    @property
     def carried(self) -> bool:
         """Whether the inputs of a bound are carried over to later bounds (see `statespace`)."""
         return self.memory == "level"

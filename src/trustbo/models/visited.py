@@ -8,7 +8,7 @@ import numpy as np
 from trustbo.data import Mission, require_map
 from trustbo.errors import TrustboError
 from trustbo.stacking import padded
-from trustbo.workspace.moves import bounds_along
+from trustbo.workspace.moves import MOVES, bounds_along
 
 _MOST = 4000  # maximum number of visited bounds, because the cost grows with its cube
 
@@ -28,12 +28,13 @@ class Visited(NamedTuple):
     cell_map: np.ndarray  # (cell,), number of the map
     bound_map: np.ndarray  # (bound,), number of the map
     squares: tuple[np.ndarray, ...]  # of each map (cell, cell): squared distances, whole numbers
+    n_posts: int  # number of sets of posts of the workspace
 
     def first(self, n: int) -> "Visited":
         """Return the places that the first n missions visited."""
         at = self.at[:n, :, None]
         bounds = np.where(at >= 0, self.bounds[at[..., 0]], -1)
-        return visited(bounds, self.shape, self.bound_map[at[:, 0, 0]])
+        return visited(bounds, self.shape, self.bound_map[at[:, 0, 0]], self.n_posts)
 
 
 def bounds_of(missions: Sequence[Mission]) -> np.ndarray:
@@ -71,12 +72,16 @@ def maps_of(missions: Sequence[Mission]) -> np.ndarray:
 
 
 def visited(
-    bounds: np.ndarray, shape: tuple[int, int] | None = None, maps: np.ndarray | None = None
+    bounds: np.ndarray,
+    shape: tuple[int, int] | None = None,
+    maps: np.ndarray | None = None,
+    n_posts: int | None = None,
 ) -> Visited:
     """Index the places of bounds (mission, bound, 3); see `bounds_of`.
 
     `shape` is the shape of the workspace's grid; by default, the grid ends at the last row and
-    column visited. `maps` (mission,) contains the numbers of the maps, by default 0. Raises
+    column visited. `maps` (mission,) contains the numbers of the maps, by default 0. `n_posts` is
+    the workspace's number of sets of posts; by default, the last set is the last one used. Raises
     TrustboError if a cell is outside the grid, or if the missions visited more than 4000 bounds.
     """
     if maps is None:
@@ -91,6 +96,8 @@ def visited(
     if shape is None:
         rows, cols = (found[bound_map == 0, 1:].max(0, initial=0) + 1).tolist()
         shape = rows, cols
+    if n_posts is None:
+        n_posts = int(found[:, 0].max(initial=0)) // len(MOVES) + 1
 
     outside = there & (on == 0) & (bounds[..., 1:] >= shape).any(-1)
     if outside.any():
@@ -117,4 +124,6 @@ def visited(
         here = cells[cell_map == number]
         squares.append(((here[:, None] - here) ** 2).sum(-1))
 
-    return Visited(shape, cells, found, cell_of.ravel(), at, cell_map, bound_map, tuple(squares))
+    return Visited(
+        shape, cells, found, cell_of.ravel(), at, cell_map, bound_map, tuple(squares), n_posts
+    )

@@ -211,7 +211,7 @@ def _layers(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> dict[str, np.n
     for i in range(history.sizes["iteration"]):
         mission = history.isel(iteration=i)
         values = shown_values(mission["trust_map"], workspace)
-        values[path_in(mission)[0]] = np.nan  # assumed
+        values[path_in(mission)[0][:2]] = np.nan  # assumed
         layers[f"mission {int(mission['iteration'])}"] = values
     return layers
 

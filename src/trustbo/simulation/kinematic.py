@@ -173,9 +173,9 @@ class KinematicSimulator(DescribedSimulator):
 
         state = self.standing(*cells[:2])
         driven = []
-        for k, (cell, after) in enumerate(zip(cells[1:], [*cells[2:], None], strict=True), start=1):
+        for k, ahead in enumerate(zip(cells[1:], [*cells[2:], None], strict=True), start=1):
             rng = np.random.default_rng([seed, k])
-            [(drive, contact, state)] = self.outcomes(world, state, k, cell, [after], rng)
+            [(drive, contact, state)] = self.outcomes(world, state, k, [ahead], rng)
             driven.append((drive.status, drive.poses, contact))
             if drive.status != "ok":
                 break
@@ -233,21 +233,23 @@ class KinematicSimulator(DescribedSimulator):
         world: World,
         state: State,
         k: int,
-        cell: Station,
-        ahead: Sequence[Station | None],
+        ahead: Sequence[tuple[Station, Station | None]],
         rng: np.random.Generator,
         *,
         expected: bool = False,
     ) -> list[tuple[Drive, np.ndarray, State]]:
-        """Simulate the k-th bound of a mission, counted from 1, for each possible next cell.
+        """Simulate the k-th bound of a mission, counted from 1, for each possible continuation.
 
-        Movements shared by several next cells are simulated once. If `expected` is True and contact
-        depends on a single scan, the detection probability is returned as contact.
+        A continuation in `ahead` consists of the cell that the bound enters, with the set of posts
+        from which T2 watches the next bound, and the next cell or None; all enter the same cell.
+        Movements shared by several continuations are simulated once. If `expected` is True and
+        contact depends on a single scan, the detection probability is returned as contact.
 
         Returns:
-            For each next cell, the movements, the contact at each tick, shape (tick, robot), and
+            For each continuation, the movements, the contact at each tick, shape (tick, robot), and
             the state after the bound.
         """
+        cell = ahead[0][0]
         # First phase: the lead drives, and T2 watches.
         goals = self._posts.stop(cell)[None]
         lead = self._move(world, state, cell, _LEAD, goals, self._max_ticks, rng)
@@ -256,10 +258,10 @@ class KinematicSimulator(DescribedSimulator):
         moves: dict[bytes, int] = {}  # index into `drives`, keyed by goals
 
         # Second phase: T2 drives to its posts for the next cell, and the lead watches.
-        for next_cell in ahead:
+        for entered, next_cell in ahead:
             run = [0]
             if lead.status == "ok":
-                goals = self._posts.watching(cell, next_cell)
+                goals = self._posts.watching(entered, next_cell)
                 key = goals.tobytes()
                 if key not in moves:
                     now = state._replace(poses=lead.poses[-1], stops=lead.stops)

@@ -1,8 +1,9 @@
 """Protocol for simulators, and a base class and functions that trustbo's simulators share."""
 
 import hashlib
+import inspect
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,6 +61,11 @@ def require_path(
     if len(stations) < 2:
         raise TrustboError(f"a path needs at least two cells, start and goal; got {stations}.")
     return stations
+
+
+def reads_post_sets(simulator: Any) -> bool:
+    """Return whether a simulator's `run` has the argument `post_sets`."""
+    return "post_sets" in inspect.signature(simulator.run).parameters
 
 
 def digest(*arrays: ArrayLike) -> str:

@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
-from trustbo.data import Cell
+from trustbo.data import POST_SETS, Cell, Station, split_path
 from trustbo.parallel import in_order
 from trustbo.simulation.kinematic import KinematicSimulator, State
+from trustbo.simulation.protocol import reads_post_sets
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import END, MOVES, next_names, possible_next, way_names
+from trustbo.workspace.moves import MOVES, next_names, possible_next, way_names
 
 _DIMS = ("move", "row", "col", "next_move")
 
@@ -18,46 +19,60 @@ _DIMS = ("move", "row", "col", "next_move")
 class Edge(NamedTuple):
     """Bound with its possible next bounds."""
 
-    move: int
-    left: Cell
+    way: int
+    left: Station
+    """Cell left, with the set of posts from which T2 watches the bound."""
     cell: Cell
-    next_moves: tuple[int, ...]
-    """Indices of the possible next moves in `MOVES`, then `END`."""
-    ahead: tuple[Cell | None, ...]
-    """Next cell for each of `next_moves`; None for `END`."""
+    next_ways: tuple[int, ...]
+    """Possible next ways, then the number of ways for the end of a path."""
+    ahead: tuple[tuple[Station, Cell | None], ...]
+    """For each of `next_ways`, the cell entered with the next set of posts, and the next cell.
+
+    The next cell is None at the end of a path."""
 
 
 type Outcomes = Iterator[tuple[Edge, list[tuple[float, str]]]]
-"""Bounds, each with the mean contact over robots and the status for each next move.
+"""Bounds, each with the mean contact over robots and the status for each next way.
 
 The contact is NaN if it was not measured.
 """
 
 
 def table_of(contact: np.ndarray, passed: np.ndarray) -> xr.Dataset:
-    """Make a dataset like `Truth.bounds` from arrays (move, row, col, next_move)."""
-    names = {"move": way_names(1), "next_move": next_names(1)}
+    """Make a dataset like `Truth.bounds` from arrays (way, row, col, next_way)."""
+    n_posts = len(contact) // len(MOVES)
+    names = {"move": way_names(n_posts), "next_move": next_names(n_posts)}
     return xr.Dataset({"contact": (_DIMS, contact), "passed": (_DIMS, passed)}, names)
 
 
-def edges_of(workspace: Workspace) -> list[Edge]:
-    """List the bounds of a workspace for which all robots have routes."""
+def edges_of(workspace: Workspace, n_posts: int = 1) -> list[Edge]:
+    """List the bounds for which all robots have routes, with the first `n_posts` sets of posts."""
     exists = workspace.passable_bounds.values
-    follows = possible_next(exists)
+    follows = possible_next(exists, n_posts)
+    n_ways = len(MOVES) * n_posts
     edges = []
-    for move, row, col in np.argwhere(exists).tolist():
-        down, right = MOVES[move]
-        to = [(row + i, col + j) for i, j in MOVES]
-        nexts = np.flatnonzero(follows[move, row, col, :END]).tolist()
+    for way, row, col in np.argwhere(follows[..., n_ways]).tolist():
+        down, right = MOVES[way % len(MOVES)]
+        nexts = np.flatnonzero(follows[way, row, col, :n_ways]).tolist()
+        ahead = []
+        for number, move in (divmod(after, len(MOVES)) for after in nexts):
+            next_cell = row + MOVES[move][0], col + MOVES[move][1]
+            ahead.append((_station(row, col, number), next_cell))
+
         edge = Edge(
-            move,
-            left=(row - down, col - right),
+            way,
+            left=_station(row - down, col - right, way // len(MOVES)),
             cell=(row, col),
-            next_moves=(*nexts, END),
-            ahead=(*(to[n] for n in nexts), None),
+            next_ways=(*nexts, n_ways),
+            ahead=(*ahead, ((row, col), None)),
         )
         edges.append(edge)
     return edges
+
+
+def _station(row: int, col: int, number: int) -> Station:
+    """Return a cell with the set of posts of this number; a cell alone has the standard set."""
+    return (row, col, POST_SETS[number]) if number else (row, col)
 
 
 def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr.Dataset:
@@ -66,17 +81,19 @@ def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr
         return simulator.expected_contact()
 
     workspace = simulator.workspace
-    shape = END, *workspace.passable.shape, END + 1
+    n_posts = workspace.n_posts if reads_post_sets(simulator) else 1
+    n_ways = len(MOVES) * n_posts
+    shape = n_ways, *workspace.passable.shape, n_ways + 1
     total = np.zeros(shape)
     n_passed = np.zeros(shape)
     n_measured = np.zeros(shape)
     n = np.zeros(shape)
     replicates = _of_bounds if isinstance(simulator, KinematicSimulator) else _of_missions
 
-    edges = edges_of(workspace)
+    edges = edges_of(workspace, n_posts)
     for edge, outcomes in replicates(simulator, edges, mission, n_replicates, seed):
-        for next_move, (contact, status) in zip(edge.next_moves, outcomes, strict=True):
-            where = edge.move, *edge.cell, next_move
+        for next_way, (contact, status) in zip(edge.next_ways, outcomes, strict=True):
+            where = edge.way, *edge.cell, next_way
             n[where] += 1.0
             if status == "ok":
                 n_passed[where] += 1.0
@@ -98,7 +115,7 @@ def _of_bounds(
     In replicate 0, which is not returned, the robots begin at their stop and posts.
     """
     world = simulator.world(mission, long_run=True)
-    ends: dict[tuple[Cell, Cell], dict[int, State]] = {}
+    ends: dict[tuple[Station, Cell], dict[int, State]] = {}
     for number in range(n + 1):
         before = ends
         ends = {where: dict(states) for where, states in ends.items()}
@@ -106,7 +123,7 @@ def _of_bounds(
         def replicate(
             edge: Edge, number: int = number, before: dict[Any, dict[int, State]] = before
         ) -> list[tuple[float, str, State]]:
-            rng = np.random.default_rng([seed, number, edge.move, *edge.cell])
+            rng = np.random.default_rng([seed, number, edge.way, *edge.cell])
             # The replicates take the preceding bounds in turn.
             states = before.get((edge.left, edge.cell), {})
             if states:
@@ -114,13 +131,13 @@ def _of_bounds(
             else:
                 state = simulator.standing(edge.left, edge.cell)
 
-            found = simulator.outcomes(world, state, 1, edge.cell, edge.ahead, rng, expected=True)
+            found = simulator.outcomes(world, state, 1, edge.ahead, rng, expected=True)
             return [(float(contact.mean()), drive.status, after) for drive, contact, after in found]
 
         for edge, outcomes in zip(edges, in_order(replicate, edges), strict=True):
-            for next_cell, (_, status, after) in zip(edge.ahead, outcomes, strict=True):
+            for (entered, next_cell), (_, status, after) in zip(edge.ahead, outcomes, strict=True):
                 if status == "ok" and next_cell is not None:
-                    ends.setdefault((edge.cell, next_cell), {})[edge.move] = after
+                    ends.setdefault((entered, next_cell), {})[edge.way] = after
             if number:
                 yield edge, [(contact, status) for contact, status, _ in outcomes]
 
@@ -132,14 +149,16 @@ def _of_missions(
     for number in range(n):
         for edge in edges:
             outcomes = []
-            for i, next_cell in enumerate(edge.ahead):
-                path = [edge.left, edge.cell]
+            for i, (entered, next_cell) in enumerate(edge.ahead):
+                stations = [edge.left, entered]
                 if next_cell is not None:
-                    path.append(next_cell)
+                    stations.append(next_cell)
 
-                entropy = [seed, number, edge.move, *edge.cell, i]
+                path, post_sets = split_path(stations)
+                options = {"post_sets": post_sets} if post_sets else {}
+                entropy = [seed, number, edge.way, *edge.cell, i]
                 drawn = int(np.random.SeedSequence(entropy).generate_state(1)[0])
-                bound = simulator.run(tuple(path), seed=drawn, mission=mission).bounds[0]
+                bound = simulator.run(path, seed=drawn, mission=mission, **options).bounds[0]
                 measured = bound.contact_rate[np.isfinite(bound.contact_rate)]
                 contact = float(measured.mean()) if len(measured) else np.nan
                 outcomes.append((contact, bound.status))

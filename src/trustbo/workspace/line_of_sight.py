@@ -99,7 +99,7 @@ def onward_maps(posts: Posts, passable: np.ndarray, n_posts: int) -> np.ndarray:
     def of_block(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return block.T, _sight_of_pairs(posts, watching, waiting, block)
 
-    blocks = np.array_split(pairs, max(1, math.ceil(len(pairs) / _PAIRS)))
+    blocks = [pairs[i : i + _PAIRS] for i in range(0, len(pairs), _PAIRS)]
     for where, seen in in_order(of_block, blocks):
         maps[:, *where] = seen.T
 
@@ -130,7 +130,7 @@ def _sight_of_waiting(posts: Posts, watching: np.ndarray) -> np.ndarray:
     """Compute how well the lead sees T2 at its posts of each way out, (way, row, col, robot)."""
     seen = np.full(watching.shape[:-1], np.nan)
     ways = np.argwhere(np.isfinite(watching[..., 0, 0]))
-    stops = np.array([posts.stop((row, col)) for _, row, col in ways.tolist()])
+    stops = np.array([posts.stop((row, col)) for _, row, col in ways.tolist()]).reshape(-1, 2)
     for i, robot in enumerate(posts.team.robots):
         places = watching[*ways.T, i]
         view = optics(posts.team.lead, robot)

@@ -135,15 +135,19 @@ def options_of(pairs: np.ndarray, n_posts: int) -> np.ndarray:
 
 
 def by_cell_left(values: np.ndarray, nowhere: float) -> np.ndarray:
-    """Index values (move, row, col) of bounds by the cell left instead of the cell entered.
+    """Index values (way, row, col) of bounds by the cell left instead of the cell entered.
 
-    Moves that leave the grid have the value `nowhere`.
+    Ways that leave the grid have the value `nowhere`.
     """
-    _, rows, cols = values.shape
+    n_ways, rows, cols = values.shape
     framed = np.pad(values, ((0, 0), (1, 1), (1, 1)), constant_values=nowhere)
-    return np.stack([
-        framed[m, 1 + down :, 1 + right :][:rows, :cols] for m, (down, right) in enumerate(MOVES)
-    ])  # fmt: skip
+    steps = MOVES * (n_ways // len(MOVES))
+    return np.stack(
+        [
+            one[1 + down :, 1 + right :][:rows, :cols]
+            for one, (down, right) in zip(framed, steps, strict=True)
+        ]
+    )
 
 
 def existing_bounds(passable: np.ndarray) -> np.ndarray:

@@ -109,7 +109,7 @@ class Workspace(Summary):
         features: Mapping[str, object] | None = None,
         bounds: bool = True,
         sight: Sight | None = None,
-        n_posts: int = 1,
+        n_posts: int | None = None,
     ) -> Self:
         """Make a workspace with features computed from a DEM and a DSM.
 
@@ -137,10 +137,12 @@ class Workspace(Summary):
                 sight and with the visibility of `terrain.PAPER_VISIBILITY`.
             sight: Assumed model of sight; by default `Sight()`.
             n_posts: Number of sets of posts, 1 to 3, from which T2 can watch the lead in each
-                bound. With more than one, planners choose a set in each cell of a path together
-                with the cells. The sets are, in this order: "standard"; "far", up to 60 m from the
-                lead's stop and 20 m apart; and "route", mostly for the sight of the lead's route.
-                Line of sight, traversability and the difficulty of driving differ between sets.
+                bound; by default 3, and 1 without `bounds`. With more than one, planners choose a
+                set in each cell of a path together with the cells. The sets are, in this order:
+                "standard"; "far", up to 60 m from the lead's stop and 20 m apart; and "route",
+                mostly for the sight of the lead's route. Line of sight, traversability and the
+                difficulty of driving differ between sets. Give 1 if contact does not depend on
+                sight, as over a radio link, or if robots cannot be told where to stand.
 
         Returns:
             Workspace whose `awareness` has the dims (robot, move, row, col, feature), with values
@@ -160,6 +162,8 @@ class Workspace(Summary):
         team = Team.of(team)
         sight = Sight.of(sight)
         grid = Grid.over(terrain, shape)
+        if n_posts is None:
+            n_posts = len(POST_SETS) if bounds else 1
         n_posts = require_whole("n_posts", n_posts, 1, len(POST_SETS))
         if n_posts > 1 and not bounds:
             raise TrustboError(

@@ -133,7 +133,8 @@ class PlaceEffect(Effect):
     ) -> Observations:
         """See `Effect.add_data`; adds the visited places."""
         shape: Any = None if on is None else on.passable.shape
-        places = visited(bounds_of(missions), shape, maps_of(missions))
+        n_posts = None if on is None else on.n_posts
+        places = visited(bounds_of(missions), shape, maps_of(missions), n_posts)
         return observations._replace(visited=places)
 
     def design(self, observations: Observations) -> Any:
