@@ -34,7 +34,7 @@ from trustbo.plots.style import GREY, ROBOTS, outlined
 
 START, GOAL, MISSIONS = (9, 0), (0, 9), 8
 HEIGHT, RADIUS = 3.0, 45.0
-BOUND = 11
+BOUND = 10
 """Number of the bound of the new path that is drawn in panel (a), from 1."""
 ASPECT = 1.43
 """Width of a panel divided by its height, as for the hillside."""

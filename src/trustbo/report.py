@@ -99,8 +99,10 @@ def facts_of(result: Result) -> dict[str, str]:
     rate = float(result.history["contact_rate"][-1])
     last = f"{rate:.1%} of the time" if np.isfinite(rate) else "not measured"
     cells = " → ".join(path["cell"])
+    ends = [result.workspace.name_of(cell) for cell in (plan.start, plan.goal)]
+    named = f"{' to '.join(ends)}: " if result.workspace.places else ""
     facts = {
-        "Path": f"{cells} (row,column; row 0 is north)",
+        "Path": f"{named}{cells} (row,column; row 0 is north)",
         "Length": f"{len(bounds)} bounds, {plan.length:.0f} m",
     }
 
@@ -172,8 +174,8 @@ def courses_of(result: Result) -> pd.DataFrame:
         plan = result.plan(start, goal)
         rows.append(
             {
-                "start": path_text([start]),
-                "goal": path_text([goal]),
+                "start": result.workspace.name_of(start),
+                "goal": result.workspace.name_of(goal),
                 "path": path_text(plan.path),
                 "bounds": len(plan.path) - 1,
                 "metres": round(plan.length),

@@ -160,7 +160,7 @@ def test_the_first_plan_of_a_campaign_is_written_as_waypoints(tmp_path):
     robots = ("lead", "r1", "r2", "r3")
     names = {"frame.yaml", *(f"waypoints_{robot}.yaml" for robot in robots)}
     assert {file.name for file in tmp_path.iterdir()} == names
-    frame = Frame(campaign.workspace.grid.center((2, 0)))
+    frame = Frame(campaign.workspace.grid.corner)
     expected = frame.of_crs(campaign.ask().stops)
     np.testing.assert_allclose(poses(tmp_path / "waypoints_lead.yaml"), expected, atol=1e-6)
 
@@ -171,7 +171,7 @@ def test_the_next_path_replaces_the_recommended_one_beside_the_map_of_the_prior(
     assert picture(tmp_path / "cost_map.pgm").min() < 98
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     lead = "waypoints_lead.yaml"
-    expected = Frame(campaign.workspace.grid.center((2, 0))).of_crs(campaign.plan().stops)
+    expected = Frame(campaign.workspace.grid.corner).of_crs(campaign.plan().stops)
     np.testing.assert_allclose(poses(tmp_path / lead), expected, atol=1e-6)
 
     other = campaign.suggest([(2, 0), (2, 1), (2, 2), (2, 3), (1, 3), (0, 3)])
@@ -207,7 +207,7 @@ def test_waypoints_of_a_replanned_mission_are_those_still_ahead(is_stuck, tmp_pa
 
     # As for a fresh plan from the cell in which the team is.
     fresh = campaign.planner.from_cell((2, 1)).evaluate(ahead, campaign.belief.mean())
-    frame = Frame(workspace.grid.center((2, 0)))
+    frame = Frame(workspace.grid.corner)
     found = poses(tmp_path / "waypoints_lead.yaml")
     np.testing.assert_allclose(found, frame.of_crs(fresh.stops), atol=1e-6)
     for i, robot in enumerate(workspace.team.names):

@@ -318,7 +318,7 @@ def test_the_explorer_shows_the_posts_of_plans_and_missions(result):
 def test_nav2_files_lead_to_the_posts_of_the_plan_and_cost_the_best_set(result, tmp_path):
     tb.export.write_nav2(tmp_path, result)
     plan = result.plan()
-    frame = tb.export.Frame(result.workspace.grid.center(plan.path[0]))
+    frame = tb.export.Frame(result.workspace.grid.corner)
     for i, robot in enumerate(result.workspace.team.names):
         poses = json.loads((tmp_path / f"waypoints_{robot}.yaml").read_text())["poses"]
         places = [[pose["pose"]["position"][axis] for axis in "xy"] for pose in poses]

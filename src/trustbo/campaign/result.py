@@ -116,7 +116,8 @@ class Result(Summary):
 
         if state.last is not None:
             plan = self.plan()
-            where = f"{path_text([plan.start])} to {path_text([plan.goal])}"
+            name_of = self.workspace.name_of
+            where = f"{name_of(plan.start)} to {name_of(plan.goal)}"
             best = f"{len(plan.path) - 1} bounds from {where}, value {plan.value:z.3g}"
             rows.append(("recommended", best))
         if state.entries and state.last is not None:
@@ -126,7 +127,7 @@ class Result(Summary):
     def _course_text(self) -> str:
         """Describe the course of the campaign, or the courses of its missions."""
         if self._own_ends is not None:
-            return " to ".join(map(str, self._own_ends))
+            return " to ".join(map(self.workspace.name_of, self._own_ends))
         n = len({entry.course.ends for entry in self.state.entries})
         return f"{n} courses, one for each mission" if n else "any; give start and goal to ask"
 
@@ -586,7 +587,7 @@ class Result(Summary):
         Missions given up with `Campaign.fail` have no number. Missions of earlier campaigns on this
         map come first and have the negative numbers that they have in `posterior`. The columns are:
 
-        - `start`, `goal`: first and last cell of the plan, such as "9,0".
+        - `start`, `goal`: first and last cell of the plan, such as "9,0", or the name of a place.
         - `robots`: robots that took part.
         - `status`: status of the mission.
         - `state`: "told" (not used yet), "learned", "excluded", "given up" or "earlier".
@@ -616,6 +617,9 @@ class Result(Summary):
         rows = [*(state.earlier_row(i) | {"mission": label} for label, i in earlier), *rows]
         columns = dict.fromkeys([*_FIRST_COLUMNS, *chain(*rows)])
         table = pd.DataFrame(rows, columns=list(columns))
+        if self.workspace.places:
+            names = {path_text([cell]): name for cell, name in self.workspace.place_in.items()}
+            table[["start", "goal"]] = table[["start", "goal"]].replace(names)
         return table.astype({"mission": "Int64"}).set_index("mission")
 
     @computing()

@@ -83,9 +83,9 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     The file contains a LineString of the path and a Point for each cell. The properties of a cell
     are the trust of each robot with its 90 % interval, and the failure probability. With a terrain,
     there is also a Point for each post and a LineString for each route. The property `layer` is
-    "path", "bounds", "posts" or "routes". Bounds, posts and routes have the property `driven`: true
-    if the bound had been driven when the mission was replanned. Lines are cut where they cross the
-    180th meridian.
+    "path", "bounds", "places" (with names), "posts" or "routes". Bounds, posts and routes have the
+    property `driven`: true if the bound had been driven when the mission was replanned. Lines are
+    cut where they cross the 180th meridian.
 
     Args:
         path: File to write or replace.
@@ -111,7 +111,14 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
         known = {name: value for name, value in row.items() if pd.notna(value)}
         features.append(_feature(plan, "bounds", place, {"bound": k, **known, "cell": cell}))
 
-    team = plan.workspace.team
+    workspace = plan.workspace
+    for place, position in workspace.places.items():
+        about = {"name": place, "cell": workspace.locate(place)}
+        if workspace.posts is not None:
+            about["from_stop_m"] = workspace.from_stop(place)
+        features.append(_feature(plan, "places", np.array(position), about))
+
+    team = workspace.team
     sets = posts_along(plan.stations)
     for k, (cell, places) in enumerate(zip(cells, _of(plan.posts), strict=False), start=1):
         for robot, place in zip(team.names, places, strict=True):

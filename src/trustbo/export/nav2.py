@@ -143,8 +143,8 @@ def write_nav2(
             `route_graph.geojson` and `frame.yaml`.
         result: Result of a campaign, or the campaign; or a plan from `Campaign.ask`,
             `Campaign.replan` or `Follower.replan`.
-        frame: Frame of all files; by default, the frame's origin is the centre of the path's first
-            cell, where the mission starts.
+        frame: Frame of all files; by default, the frame's origin is the lower left corner of the
+            planning grid, so that all courses on a ground share a frame.
         pixel: Side length of a map pixel, in metres; by default a tenth of a cell's shorter side.
 
     Raises:
@@ -167,7 +167,7 @@ def write_nav2(
     folder = to_path(folder)
     plan = result.plan() if isinstance(result, Result) else result
     workspace = result.workspace
-    place = Frame(workspace.grid.center(plan.path[0])) if frame is None else frame
+    place = Frame(workspace.grid.corner) if frame is None else frame
 
     # All contents are made before the first file is written, so that an error leaves no incomplete
     # set of files.

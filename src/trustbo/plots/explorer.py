@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from trustbo.data import POST_SETS, Station, path_text
+from trustbo.data import POST_SETS, Station
 from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning import Plan
@@ -96,7 +96,7 @@ def explore(plan: Plan, maps: xr.Dataset, history: xr.Dataset) -> Explorer:
     from bokeh.resources import INLINE
 
     n = history.sizes["iteration"]
-    start, goal = (path_text([cell]) for cell in (plan.start, plan.goal))
+    start, goal = (plan.workspace.name_of(cell) for cell in (plan.start, plan.goal))
     title = f"Path from {start} to {goal} after {n} {'mission' if n == 1 else 'missions'}"
     html = file_html(_layout(plan, maps, history), INLINE, title=title)
     viewport = '<meta name="viewport" content="width=device-width, initial-scale=1">'

@@ -473,7 +473,19 @@ def draw_cells(
     ax.set_facecolor(GREY)
     image = ax.imshow(shown, cmap=cmap, norm=norm, extent=extent_of(workspace.grid))
     draw_contours(ax, workspace, "black", 0.25)
+    draw_places(ax, workspace)
     return image
+
+
+def draw_places(ax: Axes, workspace: Workspace) -> None:
+    """Mark the named places of a workspace."""
+    for name, position in workspace.places.items():
+        x, y = np.array(position) - workspace.grid.corner
+        ax.plot(x, y, "+", color="black", markersize=7, zorder=6)
+        text = ax.annotate(
+            name, (x, y), (4, 4), textcoords="offset points", fontsize="small", zorder=6
+        )
+        text.set_path_effects(outlined(2.0, "white"))
 
 
 def shown_values(values: xr.DataArray, workspace: Workspace) -> np.ndarray:

@@ -19,8 +19,9 @@ from trustbo.errors import TrustboError, one_line, require_pair
 from trustbo.terrain.pixels import index_within, order_along, row_and_col
 from trustbo.terrain.place import converted, quiet_affine, require_proj
 
-type Location = Cell | Mapping[str, float]
-"""A cell (row, col), or a position with named coordinates; see `Grid.locate`."""
+type Location = Cell | Mapping[str, float] | str
+"""A cell (row, col), a position with named coordinates, or the name of a place of a workspace; see
+`Grid.locate` and `Workspace.with_places`."""
 WGS84 = "EPSG:4326"
 MAX_MISSING = 0.5
 """Maximum fraction of a passable cell's pixels that may be missing or too steep."""
@@ -156,11 +157,21 @@ class Grid(Summary):
 
         return int(row), int(col)
 
-    def _row_and_col(self, location: Location) -> tuple[float, float]:
+    def _row_and_col(self, location: Any) -> tuple[float, float]:
         """Convert a location to a row and column, which are fractional for a position."""
         if not isinstance(location, Mapping):
             row, col = (operator.index(i) for i in location)
             return row, col
+
+        return self.to_cell(*self.position(location))
+
+    def position(self, location: Any) -> tuple[float, float]:
+        """Return the coordinates x and y of a location, in CRS metres; see `locate`.
+
+        A cell stands for its centre.
+        """
+        if not isinstance(location, Mapping):
+            return self.center(location)
 
         names = ("lon", "lat") if "lon" in location else ("x", "y")
         x, y = (float(location[name]) for name in names)
@@ -169,7 +180,7 @@ class Grid(Summary):
 
         if names == ("lon", "lat"):
             x, y = converted(WGS84, self.require_crs(), x, y)
-        return self.to_cell(x, y)
+        return float(x), float(y)
 
     def to_cell(self, x: Any, y: Any) -> tuple[Any, Any]:
         """Convert positions in CRS metres to fractional rows and columns of cells."""

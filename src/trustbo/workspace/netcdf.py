@@ -46,6 +46,7 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
         "grid": to_json(asdict(workspace.grid)),
         "team": to_json(asdict(workspace.team)),
         "sight": to_json(workspace.sight and asdict(workspace.sight)),
+        "places": to_json(workspace.places),
     }
     if robots != workspace.team.names:
         result.attrs["robots"] = to_json(robots)
@@ -87,7 +88,11 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
 
     maps = cells["awareness"], cells["passable"]
     onward = cells.get("onward")
-    workspace = Workspace(*maps, grid, team, terrain, pixels, composites, posts, onward)
+    places = json.loads(tree.attrs.get("places", "{}"))
+    workspace = Workspace(
+        *maps, grid, team, terrain, pixels, composites, posts, onward,
+        places={name: tuple(position) for name, position in places.items()},
+    )  # fmt: skip
     robots = tree.attrs.get("robots")
     return workspace if robots is None else workspace.of_robots(json.loads(robots))
 

@@ -22,11 +22,13 @@ from trustbo.data import (
     Station,
     default_features,
     is_predicted,
+    path_text,
     require_map,
 )
 from trustbo.display import Rows, Summary, announced
 from trustbo.errors import (
     TrustboError,
+    composed,
     require_choice,
     require_kind,
     require_list,
@@ -57,6 +59,8 @@ from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface, surface_of
 from trustbo.workspace.threats import exposure_of
 
+_NO_NAME = ",=\n"
+"""Signs that cannot be part of the name of a place, because cells and positions have them."""
 _MIDDLE = (0.1, 0.9)
 """Quantiles at the ends of the middle 80 % of bounds."""
 
@@ -81,6 +85,7 @@ class Workspace(Summary):
             None with one set of posts, which predicts the mean over the next moves.
         within: Workspace of the whole team if this one is that of some of its robots (see
             `of_robots`); None if it is that of the whole team.
+        places: Positions x and y of named places, in CRS metres, by name; see `with_places`.
 
     Example:
         >>> terrain = tb.terrain.example()
@@ -98,6 +103,7 @@ class Workspace(Summary):
     posts: Posts | None = None
     onward: xr.DataArray | None = None
     within: "Workspace | None" = None
+    places: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
     def from_terrain(
@@ -286,7 +292,15 @@ class Workspace(Summary):
             *spread,
             ("sight", "none assumed" if self.sight is None else str(self.sight)),
             ("terrain", " x ".join(map(str, n_pixels)) + " pixels" if n_pixels else "none"),
+            *((f"  {name}", self._place_text(name)) for name in self.places),
         ]
+
+    def _place_text(self, name: str) -> str:
+        """Return where a place is, as text."""
+        where = f"cell {path_text([self.locate(name)])}"
+        return (
+            where if self.posts is None else f"{where}, {self.from_stop(name):.0f} m from its stop"
+        )
 
     def _middle_of(self, feature: str) -> str:
         """Return the range of a feature in the middle 80 % of bounds, as text."""
@@ -296,6 +310,61 @@ class Workspace(Summary):
             return "no bounds"
         low, high = np.quantile(known, _MIDDLE)
         return f"{low:.2f} to {high:.2f}"
+
+    def with_places(self, places: Mapping[str, Location]) -> "Workspace":
+        """Return the workspace with names for places, which can be given instead of cells.
+
+        A place stands for the cell that contains it. Missions begin and end at the stop of this
+        cell, which may be some metres away; see `from_stop`. Tables, reports, maps and GeoJSON
+        files show the names. Other places of the workspace are kept.
+
+        Args:
+            places: Cells or positions by name; see `locate`. A name must not contain "," or "=".
+
+        Raises:
+            TrustboError: A name is not a text or contains one of these signs, or a location is
+                invalid, off the grid or impassable.
+
+        Example:
+            >>> workspace = workspace.with_places({"camp": (9, 1), "hill": {"x": x, "y": y}})
+            >>> plan = tb.Campaign(workspace).ask("camp", "hill")
+        """
+        require_kind("places", places, Mapping, 'give names with locations, as {"camp": (9, 1)}')
+        found = dict(self.places)
+        for name, location in places.items():
+            if not isinstance(name, str) or not name.strip() or {*name} & {*_NO_NAME}:
+                raise TrustboError(
+                    f'the name of a place must be a text without "," and "="; got {name!r}.'
+                )
+            self.locate(location, f"place {name!r}")
+            known = isinstance(location, str)
+            found[composed(name)] = (
+                self.places[composed(location)] if known else self.grid.position(location)
+            )
+        return dataclasses.replace(self, places=found)
+
+    def from_stop(self, name: str) -> float:
+        """Return the distance of a place from the lead's stop in its cell, m; 0 without a terrain.
+
+        Raises:
+            TrustboError: There is no place of this name.
+        """
+        cell = self.locate(name)
+        if self.posts is None:
+            return 0.0
+        return float(np.hypot(*(self.posts.stop(cell) - self.places[composed(name)])))
+
+    def name_of(self, cell: Cell) -> str:
+        """Return the name of the first place in a cell, or the cell as text, such as "9,1"."""
+        return self.place_in.get(cell, path_text([cell]))
+
+    @property
+    def place_in(self) -> dict[Cell, str]:
+        """Name of the first place in each cell that has one."""
+        found: dict[Cell, str] = {}
+        for name, (x, y) in self.places.items():
+            found.setdefault(self.grid.locate({"x": x, "y": y}), name)
+        return found
 
     @property
     def whole(self) -> "Workspace":
@@ -557,13 +626,17 @@ class Workspace(Summary):
         """Find the passable cell at a location.
 
         Args:
-            location: Cell (row, col), or a position such as `{"x": 1748000.0, "y": 5427000.0}` in
-                CRS metres or `{"lon": 174.7, "lat": -41.3}` in degrees (WGS 84).
+            location: Cell (row, col); a position such as `{"x": 1748000.0, "y": 5427000.0}` in CRS
+                metres or `{"lon": 174.7, "lat": -41.3}` in degrees (WGS 84); or the name of a place
+                (see `with_places`).
             what: Name of the location in error messages.
 
         Raises:
-            TrustboError: The location is invalid or off the grid, or the cell is impassable.
+            TrustboError: The location is invalid or off the grid, the cell is impassable, or there
+                is no place of this name.
         """
+        if isinstance(location, str):
+            location = self._place(location, what)
         cell = self.grid.locate(location, what)
         grid = self.grid
         if not self.passable.values[cell]:
@@ -575,6 +648,16 @@ class Workspace(Summary):
                 f"cell is {near}."
             )
         return cell
+
+    def _place(self, name: str, what: str) -> dict[str, float]:
+        """Return the position of a place; raises TrustboError if there is none of this name."""
+        if not self.places:
+            raise TrustboError(
+                f"{what} {name!r} is not known: the workspace has no places; give a cell or a "
+                "position, or name the place with workspace.with_places."
+            )
+        x, y = self.places[require_choice(what, name, self.places)]
+        return {"x": x, "y": y}
 
     def _why_impassable(self, cell: Cell) -> str:
         """Return, for a message, the reason why a cell is impassable; empty without a terrain."""
