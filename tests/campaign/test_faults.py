@@ -116,7 +116,9 @@ def template(workspace, tmp_path_factory):
     return folder
 
 
-OPERATIONS = "tell", "fail", "exclude", "withdraw", "suggest", "replan", "ask", "ask back"
+OPERATIONS = (
+    "tell", "fail", "exclude", "correct", "withdraw", "suggest", "replan", "ask", "ask back"
+)  # fmt: skip
 
 
 def operations(campaign, mission):
@@ -135,6 +137,7 @@ def operations(campaign, mission):
         "tell": lambda: campaign.tell(mission),
         "fail": lambda: campaign.fail("stuck", where=campaign.ask().path[1]),
         "exclude": lambda: campaign.exclude(1, "the lidar was covered"),
+        "correct": lambda: campaign.correct(1, mission, "another detector"),
         "withdraw": withdraw,
         "suggest": lambda: campaign.suggest(OTHER),
         "replan": lambda: campaign.replan((2, 0), blocked=[campaign.ask().path[:2]]),

@@ -122,9 +122,15 @@ def test_a_mission_that_is_corrected_counts_once(ground, tmp_path):
         right = robots.run(path, seed=1, mission=0)
         wrong = replace(right, contact_rate=0.5 * right.contact_rate, n_ticks=right.n_ticks * 2.0)
         campaign.tell(replace(wrong, contact=()))
-        campaign.exclude(1, "log of another detector")
-        campaign.suggest(path)
-        campaign.tell(right)
+        campaign.correct(1, right, "log of another detector")
+        table = campaign.table()
+        assert table["state"].tolist() == ["excluded", "learned"]
+        assert "corrected, see mission 2: log of another detector" in table.loc[1, "reason"]
+        assert table["path"].nunique() == 1
+        with pytest.raises(tb.TrustboError, match="already excluded"):
+            campaign.correct(1, right, "again")
+        with pytest.raises(tb.TrustboError, match="same data"):
+            campaign.correct(2, right, "twice")
 
         known = bounds_of(campaign)
         driven = known["begun"].iloc[1:] > 0

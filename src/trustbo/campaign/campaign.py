@@ -24,7 +24,7 @@ from trustbo.campaign.settings import (
     to_settings,
 )
 from trustbo.campaign.simulated import require_simulator, run_missions, settings_of
-from trustbo.campaign.state import Entry, Failure, State
+from trustbo.campaign.state import Entry, Exclusion, Failure, State
 from trustbo.campaign.stopping import Stop, require_stop
 from trustbo.data import Cell, Mission, cells_of, require_path
 from trustbo.display import joined, say
@@ -376,27 +376,77 @@ class Campaign(Recorder):
             if not again:
                 require_new(self.state, mission)
 
-            learned = as_learned(mission, self.workspace, self.state.settings["awareness"])
-            if mission.robots != self.workspace.team.names:
-                team = self.workspace.team.names
-                self.learner.require_poolable([mission.with_robots(team)], team)
-            plan = self._plan_told(mission)
-            trust_map = self._trust_map_of(Course.of(plan))
+            return self._add(mission, asked)
 
-            before = self.state
-            entry = Entry(plan, mission, learned, trust_map, posterior=before.last)
-            recorded = f"mission {len(before.entries) + 1} is recorded"
-            try:
-                self._record(entries=(*before.entries, entry), asked=None)
-            except BaseException as error:
-                if self.state is not before:  # an interrupt that was held back
-                    error.add_note(f"{recorded}; it will be learned at the next call.")
-                raise
+    def correct(self, n: int, mission: Mission, reason: str) -> xr.DataTree | None:
+        """Replace a mission whose log was wrong, and learn from the corrected one.
 
-            if entry.why_excluded is not None:
-                warn(f"mission {len(self.state.entries)} is excluded: {entry.why_excluded}")
-            self._learn_and_write(recorded)
-            return self.state.posterior
+        The wrong mission is excluded, with the reason, and the corrected one is recorded under the
+        next number, with the plan of the wrong one. Both are recorded in one step.
+
+        Args:
+            n: Number of the wrong mission, from 1.
+            mission: Corrected mission, as for `tell`.
+            reason: Reason to store in the table of missions.
+
+        Returns:
+            Posterior, as for `tell`.
+
+        Raises:
+            TrustboError: There is no such mission, it is already excluded by a user, the reason is
+                empty, or the corrected mission is refused as by `tell`. Nothing is then recorded.
+
+        Example:
+            >>> campaign.correct(1, drive(path), "log of another detector")
+        """
+        require_kind("mission", mission, Mission, "give one trustbo.Mission at a time")
+        with self._turn:
+            entries = self.state.entries
+            before = [entry.exclusion and entry.exclusion.reason for entry in entries]
+            self._require_counts("mission", n, reason, before, "excluded")
+
+            plan = entries[n - 1].plan
+            mission = self._in_order(mission, plan.robots)
+            require_new(self.state, mission)
+            reason = f"corrected, see mission {len(entries) + 1}: {reason}"
+            return self._add(mission, plan, {n: reason})
+
+    def _add(
+        self, mission: Mission, asked: Plan | None, wrong: Mapping[int, str] | None = None
+    ) -> xr.DataTree | None:
+        """Record a mission and learn from it.
+
+        Args:
+            mission: Mission with its robots and features in the order of the workspace.
+            asked: Plan of the mission; None if no path was asked for.
+            wrong: Reasons for which other missions are excluded in the same step, by number.
+        """
+        learned = as_learned(mission, self.workspace, self.state.settings["awareness"])
+        if mission.robots != self.workspace.team.names:
+            team = self.workspace.team.names
+            self.learner.require_poolable([mission.with_robots(team)], team)
+        plan = self._plan_told(mission, asked)
+        trust_map = self._trust_map_of(Course.of(plan))
+
+        before = self.state
+        entries = list(before.entries)
+        for n, reason in (wrong or {}).items():
+            exclusion = Exclusion(len(entries), reason)
+            entries[n - 1] = replace(entries[n - 1], exclusion=exclusion)
+
+        entry = Entry(plan, mission, learned, trust_map, posterior=before.last)
+        recorded = f"mission {len(entries) + 1} is recorded"
+        try:
+            self._record(entries=(*entries, entry), asked=None)
+        except BaseException as error:
+            if self.state is not before:  # an interrupt that was held back
+                error.add_note(f"{recorded}; it will be learned at the next call.")
+            raise
+
+        if entry.why_excluded is not None:
+            warn(f"mission {len(self.state.entries)} is excluded: {entry.why_excluded}")
+        self._learn_and_write(recorded)
+        return self.state.posterior
 
     def _in_order(self, mission: Mission, robots: Sequence[str] | None) -> Mission:
         """Return a mission with its robots and features in the order of the workspace.
@@ -434,7 +484,7 @@ class Campaign(Recorder):
             )
         return self.workspace.in_order(mission)
 
-    def _plan_told(self, mission: Mission) -> Plan:
+    def _plan_told(self, mission: Mission, asked: Plan | None) -> Plan:
         """Return the plan of a mission that is told.
 
         It is the plan that was asked for, if the mission has its start and its goal. If no path was
@@ -442,7 +492,6 @@ class Campaign(Recorder):
         of its own path.
         """
         start, last = (mission.path[k] for k in (0, -1))
-        asked = self.state.asked
         ends = self._own_ends if asked is None else (asked.start, asked.goal)
         if ends is not None and start == ends[0] and (mission.status != "ok" or last == ends[1]):
             if asked is not None:
