@@ -32,6 +32,7 @@ from trustbo.parallel import computing
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.maps import maps_of
 from trustbo.planning.robot_trust import robot_maps, robot_trust
+from trustbo.planning.ways import Ways, ways_of
 from trustbo.simulation import Truth
 from trustbo.stacking import padded
 from trustbo.workspace import Workspace
@@ -475,6 +476,37 @@ class Result(Summary):
             >>> result.compare_posts().query("chosen")
         """
         return self.planner.compare_posts(self.plan().stations, self.belief)
+
+    def ways(
+        self,
+        start: Location | None = None,
+        goal: Location | None = None,
+        *,
+        robots: Sequence[str] | None = None,
+    ) -> Ways:
+        """Compare ways of a course: best contact, safest, shortest, and what lies between.
+
+        The price of a failure is that of the campaign's plans. To drive way k, pass
+        `ways[k].stations` to `Campaign.suggest`.
+
+        Args:
+            start: First cell, as in `plan`.
+            goal: Last cell, as in `plan`.
+            robots: Names of the robots that take part; by default the whole team.
+
+        Raises:
+            TrustboError: The objective is not lost_contact, an end is missing or is not a passable
+                cell, or a robot is unknown.
+            NoPathError: The goal cannot be reached.
+
+        Example:
+            >>> ways = result.ways((9, 0), (0, 9))
+            >>> ways.to_frame()[["name", "contact_lost", "p_arrive", "metres"]]
+        """
+        course = self._shown(start, goal, robots)
+        return self._of_course(
+            "ways", course, lambda: ways_of(self.planner_of(course), self._belief_of(course))
+        )
 
     def watchers(
         self,
