@@ -67,7 +67,7 @@ def test_a_resumed_campaign_equals_one_that_was_not_interrupted(campaign, flags,
 
 def test_an_existing_campaign_is_replaced_only_if_asked_to(campaign, flags, capsys):
     before = sorted(campaign.iterdir())
-    assert call(*flags, "--missions", 1, "--out", campaign) == 2
+    assert call(*flags, "--missions", 1, "--out", campaign) == 1
     assert capsys.readouterr().err.count("error: ") == 1
     assert sorted(campaign.iterdir()) == before
 
@@ -91,14 +91,14 @@ def test_info_on_a_full_disk_leaves_the_figure_as_it_was(rasters, tmp_path, caps
     picture.write_bytes(b"before")
     files = rasters / "dem.tif", rasters / "dsm.tif"
     with full_disk():
-        assert call("info", *files, "--shape", "3,3", "--out", picture) == 2
+        assert call("info", *files, "--shape", "3,3", "--out", picture) == 1
     assert "grid.png" in capsys.readouterr().err
     assert picture.read_bytes() == b"before"
 
 
 def test_info_refuses_an_unknown_format_of_the_figure(rasters, tmp_path, capsys):
     files = rasters / "dem.tif", rasters / "dsm.tif"
-    assert call("info", *files, "--shape", "3,3", "--out", tmp_path / "grid.xyz") == 2
+    assert call("info", *files, "--shape", "3,3", "--out", tmp_path / "grid.xyz") == 1
     assert "xyz" in capsys.readouterr().err
 
 
@@ -132,7 +132,7 @@ def test_info_states_the_slope_limit_and_the_cells_that_are_passable_with_it(
 )
 def test_a_missing_file_is_an_error_of_one_line(words, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert call(*words) == 2
+    assert call(*words) == 1
     assert capsys.readouterr().err.startswith("error: ")
     assert list(tmp_path.iterdir()) == []
 
@@ -147,7 +147,7 @@ def test_paths_with_letters_that_the_terminal_lacks_are_printed(
     if name == "stdout":
         assert call("export", campaign, "--format", "csv", "--out", folder) == 0
     else:
-        assert call("resume", folder) == 2
+        assert call("resume", folder) == 1
     assert b"??" in written.getvalue()
 
 
@@ -170,7 +170,7 @@ def test_an_interrupted_command_says_how_to_resume_a_campaign(campaign, capsys, 
     ],
 )  # fmt: skip
 def test_impossible_values_are_refused_before_anything_is_written(changed, flags, tmp_path, capsys):
-    assert call(*flags, *changed, "--out", tmp_path / "out") == 2
+    assert call(*flags, *changed, "--out", tmp_path / "out") in (1, 2)  # 2: by argparse
     assert "error: " in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -184,7 +184,7 @@ def test_impossible_values_are_refused_before_anything_is_written(changed, flags
     ],
 )
 def test_errors_speak_of_the_flag_and_its_unit(changed, said, flags, tmp_path, capsys):
-    assert call(*flags, *changed, "--out", tmp_path / "out") == 2
+    assert call(*flags, *changed, "--out", tmp_path / "out") in (1, 2)  # 2: by argparse
     assert said in capsys.readouterr().err
 
 

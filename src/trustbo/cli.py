@@ -1,4 +1,7 @@
-"""Command-line interface: `trustbo demo`, `info`, `run`, `resume` and `export`.
+"""Command-line interface: `trustbo demo`, `run`, ...; see `parser` for all commands.
+
+Simulated campaigns are run by `demo`, `run` and `resume`. Those of real robots are begun by `new`,
+asked for paths and told their logs; see `field_commands`.
 
 Commands import heavy modules only when they run, so that `--help` takes a tenth of a second.
 """
@@ -12,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from trustbo import field_commands as field
 from trustbo.errors import TrustboError
 
 if TYPE_CHECKING:
@@ -22,11 +26,15 @@ if TYPE_CHECKING:
 POLICIES = ("explore", "greedy", "optimistic", "thompson", "ucb", "random")
 OBJECTIVES = ("lost_contact", "terminal", "mean")
 FORMATS = ("geotiff", "geojson", "csv", "nav2")
-BAD_INPUT = 2
-"""Exit code for input that trustbo refuses."""
+LIMITS = ("measured", "data sheet", "guessed")
+BAD_INPUT = 1
+"""Exit code for input that trustbo refuses; argparse exits with 2 if the words are wrong."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as in a shell."""
-PLACE = "ROW,COL with row 0 in the north, x=...,y=... in CRS metres, or lon=...,lat=... (degrees)"
+LOCATION = (
+    "ROW,COL with row 0 in the north, x=...,y=... in CRS metres, lon=...,lat=... (degrees), or the "
+    "name of a place"
+)
 _COLUMNS = ["status", "contact_rate", "objective", "k_hat", "r_hat", "path_changed"]
 """Columns of the table of missions to print."""
 
@@ -45,8 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     try:
         args.run(args)
     except KeyboardInterrupt:
-        folder = getattr(args, "folder", None) or args.out
-        can_resume = args.run is not export and Path(folder, "campaign.json").is_file()
+        folder = getattr(args, "folder", None) or getattr(args, "out", ".")
+        can_resume = args.run in (demo, run, resume) and Path(folder, "campaign.json").is_file()
         remedy = f"; continue with: trustbo resume {folder}" if can_resume else ""
         _exit(f"interrupted{remedy}", INTERRUPTED)
     except (TrustboError, OSError) as error:
@@ -64,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="trustbo",
         description="Learn where robots are trustworthy on a terrain, and plan the best path.",
-        epilog="exit codes: 0 success, 2 bad input, 130 interrupted",
+        epilog="exit codes: 0 success, 1 bad input, 2 wrong words, 130 interrupted",
     )
     top.add_argument("--version", action="version", version=f"trustbo {version('trustbo')}")
     top.set_defaults(run=lambda _: top.print_help())
@@ -89,8 +97,14 @@ def parser() -> argparse.ArgumentParser:
     add = command(run, "Run a simulated campaign on a given terrain.", example)
     add("--dem", type=Path, required=True, metavar="FILE", help="raster of ground heights")
     add("--dsm", type=Path, metavar="FILE", help="raster of surface heights")
-    add("--start", type=place, required=True, metavar="PLACE", help=PLACE)
-    add("--goal", type=place, required=True, metavar="PLACE", help="in the same format as --start")
+    add("--start", type=place, required=True, metavar="LOCATION", help=LOCATION)
+    add(
+        "--goal",
+        type=place,
+        required=True,
+        metavar="LOCATION",
+        help="in the same format as --start",
+    )
     _add_workspace(add)
     add("--policy", choices=POLICIES, help="policy that chooses the paths (default explore)")
     add("--objective", choices=OBJECTIVES, help="objective of the paths (default lost_contact)")
@@ -108,7 +122,76 @@ def parser() -> argparse.ArgumentParser:
     add("folder", type=Path, metavar="DIR", help="folder of the campaign")
     add("--format", choices=FORMATS, nargs="+", default=FORMATS[:2], help="default geotiff geojson")
     add("--out", type=Path, metavar="DIR", help="output folder (default: campaign folder)")
+    _add_field_commands(command)
     return top
+
+
+def _add_field_commands(command: Callable[..., Any]) -> None:
+    """Add the commands for campaigns of real robots."""
+    folder = {"type": Path, "metavar": "FOLDER", "help": "folder of the campaign"}
+    robots = {"type": _names, "metavar": "NAMES", "help": "robots that go, such as alpha,bravo"}
+
+    example = "week --dem dem.tif --dsm dsm.tif --shape 12,10 --max-slope 18 --place camp=9,1"
+    add = command(new, "Begin a campaign of real robots on a ground.", example)
+    add("folder", **folder)
+    add("--dem", type=Path, required=True, metavar="FILE", help="raster of ground heights")
+    add("--dsm", type=Path, metavar="FILE", help="raster of surface heights")
+    _add_workspace(add)
+    add("--names", type=_names, metavar="NAMES", help="names of the robots, such as alpha,bravo")
+    text = f"name of a location, such as camp=9,1; repeat it. {LOCATION}"
+    add("--place", type=_named_place, action="append", metavar="NAME=LOCATION", help=text)
+    add("--limit", choices=LIMITS, help="how the slope limit is known (default data sheet)")
+    add("--posts", type=int, choices=(1, 3), help="sets of posts of each cell (default 3)")
+    add("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
+
+    def add_course(add: Any) -> None:
+        add("start", type=place, metavar="START", help=LOCATION)
+        add("goal", type=place, metavar="GOAL", help="in the same format as START")
+        add("--robots", **robots)
+
+    add = command(field.ask, "Plan the next mission.", "week camp hill --nav2 nav2")
+    add("folder", **folder)
+    add_course(add)
+    add("--way", type=int, metavar="K", help="take way K of `trustbo ways` instead of the best")
+    add("--nav2", type=Path, metavar="DIR", help="folder for the waypoints of Nav2")
+    add("--geojson", type=Path, metavar="FILE", help="file for the path")
+
+    add = command(field.ways, "Compare ways by contact, arrival and metres.", "week camp hill")
+    add("folder", **folder)
+    add_course(add)
+
+    def add_log(add: Any) -> None:
+        add("log", type=Path, metavar="LOG", help="table (CSV), ROS bag, or poses for --detections")
+        add("--detections", type=Path, metavar="FILE", help="detections, if LOG contains poses")
+        add("--tick", type=float, default=1.0, metavar="S", help="seconds of a detector reading")
+        add(
+            "--status",
+            default="aborted",
+            metavar="TEXT",
+            help="why tracks end early, such as stuck",
+        )
+
+    add = command(field.tell, "Record the log of a mission, and learn from it.", "week log.csv")
+    add("folder", **folder)
+    add_log(add)
+
+    add = command(field.fail, "Report a mission in which nothing was measured.", "week stuck")
+    add("folder", **folder)
+    add("reason", metavar="REASON", help="such as stuck, tipped, or rain")
+    add("--where", type=shape, metavar="ROW,COL", help="cell that was not reached")
+
+    add = command(field.correct, "Replace a mission whose log was wrong.", "week 5 right.csv ...")
+    add("folder", **folder)
+    add("mission", type=_count, metavar="N", help="number of the wrong mission")
+    add_log(add)
+    add("--reason", required=True, metavar="TEXT", help="why the log was wrong")
+
+    add = command(field.status, "Show the ground and all missions.", "week")
+    add("folder", **folder)
+
+    add = command(field.report, "Write a report as an HTML page.", "week --out report.html")
+    add("folder", **folder)
+    add("--out", type=Path, default=Path("report.html"), metavar="FILE", help="file to write")
 
 
 def _add_campaign(add: Any, folder: str) -> None:
@@ -161,12 +244,23 @@ def slope(text: str) -> float:
     return degrees
 
 
-def place(text: str) -> tuple[int, int] | dict[str, float]:
-    """Parse a cell, such as "9,0", or a position, such as "x=1748000,y=5427000"."""
-    if "=" not in text:
-        return shape(text)
-    pairs = (part.split("=") for part in text.split(","))
-    return {name.strip(): float(value) for name, value in pairs}
+def place(text: str) -> tuple[int, int] | dict[str, float] | str:
+    """Parse a cell, such as "9,0", a position, such as "x=1748000,y=5427000", or a name."""
+    if "=" in text:
+        pairs = (part.split("=") for part in text.split(","))
+        return {name.strip(): float(value) for name, value in pairs}
+    return shape(text) if "," in text else text
+
+
+def _named_place(text: str) -> tuple[str, Any]:
+    """Parse a place with its name, such as "camp=9,1" or "camp=x=1748000,y=5427000"."""
+    name, _, where = text.partition("=")
+    return name, place(where)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """Parse names, such as "alpha,bravo"."""
+    return tuple(name.strip() for name in text.split(","))
 
 
 def demo(args: argparse.Namespace) -> None:
@@ -184,9 +278,9 @@ def info(args: argparse.Namespace) -> None:
     import trustbo as tb
     from trustbo.files import write_file
 
-    workspace = _workspace(args)
+    workspace = workspace_of(args)
     print(workspace)
-    print(_passable(workspace))
+    print(passable_text(workspace))
     plt.switch_backend("agg")
     tb.plots.grid_map(workspace)
     picture = io.BytesIO()
@@ -210,13 +304,13 @@ def run(args: argparse.Namespace) -> None:
         options = dict(tb.paper.CAMPAIGN)
     given = {"policy": args.policy, "objective": args.objective}
     options |= {name: value for name, value in given.items() if value is not None}
-    workspace = _workspace(args, {"start": args.start, "goal": args.goal}, **features)
+    workspace = workspace_of(args, {"start": args.start, "goal": args.goal}, **features)
     if not args.quiet:
-        print(_passable(workspace))
+        print(passable_text(workspace))
     _run(args, workspace, start=args.start, goal=args.goal, **options, stop=_stop(args))
 
 
-def _workspace(
+def workspace_of(
     args: argparse.Namespace, ends: Mapping[str, Any] | None = None, **features: Any
 ) -> "Workspace":
     """Make the workspace from the flags of `_add_workspace`, after a check of the ends of paths.
@@ -235,11 +329,12 @@ def _workspace(
     for name, end in (ends or {}).items():  # before the slow computation of awareness
         Grid.over(terrain, args.shape).locate(end, name)
     robot = tb.Robot(max_slope=radians(args.max_slope))
-    team = tb.Team(robots=(robot,) * args.robots, lead=robot)
+    names = getattr(args, "names", None) or ()
+    team = tb.Team(robots=(robot,) * (len(names) or args.robots), lead=robot, names=names)
     return tb.Workspace.from_terrain(terrain, args.shape, team, **features)
 
 
-def _passable(workspace: "Workspace") -> str:
+def passable_text(workspace: "Workspace") -> str:
     """Return, as text, the robots' slope limit and how many cells are passable with it."""
     from math import degrees
 
@@ -272,6 +367,20 @@ def _stop(args: argparse.Namespace) -> Any:
     from trustbo import RegretBound
 
     return None if args.stop_regret is None else RegretBound(eps=args.stop_regret)
+
+
+def new(args: argparse.Namespace) -> None:
+    """Begin a campaign of real robots, and print the ground."""
+    import trustbo as tb
+
+    options = {} if args.posts is None else {"n_posts": args.posts}
+    workspace = workspace_of(args, **options).with_places(dict(args.place or ()))
+    hazard = tb.hazard.Hazard(**({} if args.limit is None else {"limit": args.limit}))
+    campaign = tb.Campaign(workspace, hazard=hazard, seed=args.seed, directory=args.folder)
+    campaign.close()
+    print(workspace)
+    print(passable_text(workspace))
+    print(f"the campaign is in {args.folder}; ask it for a course: trustbo ask {args.folder} ...")
 
 
 def resume(args: argparse.Namespace) -> None:

@@ -1,0 +1,170 @@
+"""Commands for campaigns of real robots: `ask`, `ways`, `tell`, `fail`, `correct`, and `status`.
+
+Each command loads the campaign from its folder, which is locked meanwhile, and does one thing.
+`trustbo new` begins the campaign. An error has recorded nothing.
+"""
+
+from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from trustbo.errors import TrustboError
+
+if TYPE_CHECKING:
+    from trustbo.campaign.campaign import Campaign
+    from trustbo.data import Mission
+    from trustbo.planning import Plan
+    from trustbo.workspace import Workspace
+
+_BAG = (".bag", ".mcap", ".db3")
+"""Endings of the files of a ROS bag; that of ROS 2 may also be a folder."""
+_STATUS = ("start", "goal", "robots", "status", "state", "contact_lost", "n_bounds", "reason")
+"""Columns of the table that `status` prints."""
+
+
+@contextmanager
+def loaded(folder: Path) -> "Iterator[Campaign]":
+    """Load the campaign of a folder, and close it afterwards."""
+    import trustbo as tb
+
+    with tb.Campaign.load(folder, progress=False) as campaign:
+        yield campaign
+
+
+def ask(args: Namespace) -> None:
+    """Plan the next mission, print the plan, and write its files."""
+    from trustbo.export import write_geojson, write_nav2
+
+    with loaded(args.folder) as campaign:
+        if args.way is None:
+            plan = campaign.ask(args.start, args.goal, robots=args.robots)
+        else:
+            ways = campaign.ways(args.start, args.goal, robots=args.robots)
+            if not 0 <= args.way < len(ways):
+                raise TrustboError(
+                    f"there is no way {args.way}; there are ways 0 to {len(ways) - 1}."
+                )
+            plan = campaign.suggest(ways[args.way].stations, robots=args.robots)
+
+        workspace = campaign.workspace
+        robots = ", ".join(plan.robots)
+        print(f"{workspace.name_of(plan.start)} to {workspace.name_of(plan.goal)}, with {robots}")
+        print(parts_text(campaign, plan))
+        print(plan)
+        if args.nav2 is not None:
+            write_nav2(args.nav2, plan)
+            print(f"waypoints for Nav2 are in {args.nav2}")
+        if args.geojson is not None:
+            write_geojson(args.geojson, plan)
+            print(f"the path is in {args.geojson}")
+
+
+def parts_text(campaign: "Campaign", plan: "Plan") -> str:
+    """Return the parts of a plan's value: contact lost and the price of failure, as text."""
+    from trustbo.campaign.course import Course
+
+    problem = campaign.planner_of(Course.of(plan)).problem
+    if not problem.objective.of_contact:
+        return f"value {plan.value:.2f} ({plan.objective})"
+    price = problem.failure_along(plan.stations)
+    lost = -plan.value - price - problem.bound_cost_along(plan.stations)
+    cost = problem.cost_of_failure
+    return (
+        f"contact lost: {lost:.2f} of {len(plan.path) - 1} bounds; price of failure: {price:.2f} "
+        f"({cost:g} bounds times its probability); {plan.length:.0f} m"
+    )
+
+
+def ways(args: Namespace) -> None:
+    """Print the ways of a course; none is recorded."""
+    with loaded(args.folder) as campaign:
+        table = campaign.ways(args.start, args.goal, robots=args.robots).to_frame()
+        table["metres"] = table["metres"].round().astype(int)
+        shown = ["name", "bounds", "metres", "contact_lost", "p_arrive", "price", "path"]
+        print(table[shown].to_string(float_format="%.3f"))
+        print("to drive way K: trustbo ask FOLDER START GOAL --way K")
+
+
+def tell(args: Namespace) -> None:
+    """Record the missions of a log, and print what they measured."""
+    with loaded(args.folder) as campaign:
+        for mission in _missions_in(args, campaign.workspace, campaign.state.asked):
+            campaign.tell(mission)
+            _print_last(campaign)
+
+
+def fail(args: Namespace) -> None:
+    """Report that nothing was measured in the planned mission."""
+    with loaded(args.folder) as campaign:
+        campaign.fail(args.reason, where=args.where)
+        print(f"recorded: {args.reason}, without a measured mission")
+
+
+def correct(args: Namespace) -> None:
+    """Replace a mission by that of another log."""
+    with loaded(args.folder) as campaign:
+        entries = campaign.state.entries
+        planned = entries[args.mission - 1].plan if args.mission <= len(entries) else None
+        missions = _missions_in(args, campaign.workspace, planned)
+        if len(missions) != 1:
+            raise TrustboError(
+                f"the log has {len(missions)} missions; give that of mission {args.mission} alone."
+            )
+        campaign.correct(args.mission, missions[0], args.reason)
+        print(f"mission {args.mission} is excluded; the correction is the next mission:")
+        _print_last(campaign)
+
+
+def status(args: Namespace) -> None:
+    """Print the ground, the campaign and a table of its missions."""
+    with loaded(args.folder) as campaign:
+        print(campaign.workspace)
+        print(campaign)
+        table = campaign.table().filter(_STATUS)
+        if len(table):
+            print(table.to_string(float_format="%.2f", na_rep=""))
+        asked = campaign.state.asked
+        if asked is not None:
+            name_of = campaign.workspace.name_of
+            print(f"asked for: {name_of(asked.start)} to {name_of(asked.goal)}; tell or fail it")
+
+
+def report(args: Namespace) -> None:
+    """Write the report of a campaign."""
+    import matplotlib as mpl
+
+    from trustbo.report import write_report
+
+    mpl.use("agg")
+    with loaded(args.folder) as campaign:
+        write_report(args.out, campaign)
+    print(f"the report is in {args.out}")
+
+
+def _missions_in(args: Namespace, workspace: "Workspace", plan: "Plan | None") -> "list[Mission]":
+    """Read the missions of the log that the arguments name; tracks need the plan of the mission."""
+    from trustbo import logs
+
+    if args.detections is not None:
+        if plan is None:
+            raise TrustboError(
+                "tracks need the plan of their mission, but no mission is asked for; call "
+                "`trustbo ask` first."
+            )
+        options: dict[str, Any] = {"path": plan.path, "tick": args.tick, "status": args.status}
+        return logs.read_tracks(args.log, args.detections, workspace, **options)
+    if args.log.suffix in _BAG or args.log.is_dir():
+        return logs.read_bag(args.log, workspace)
+    return logs.read_table(args.log)
+
+
+def _print_last(campaign: "Campaign") -> None:
+    """Print what the last mission measured."""
+    row = campaign.table().iloc[-1]
+    n_planned = len(campaign.missions[-1].path) - 1
+    print(
+        f"mission {len(campaign.missions)}: {row['start']} to {row['goal']}, {row['status']}, "
+        f"{row['contact_lost']:.2f} of {n_planned} bounds of contact lost ({row['state']})"
+    )
