@@ -8,19 +8,13 @@ import sys
 import numpy as np
 import pytest
 import rasterio
+from commands import call
 from disks import full_disk
 from worlds import hillside
 
 import trustbo as tb
-from trustbo.cli import FORMATS, OBJECTIVES, POLICIES, main
+from trustbo.cli import FORMATS, LIMITS, OBJECTIVES, POLICIES
 from trustbo.export import WRITERS as ALL_FORMATS
-
-
-def call(*words):
-    """Exit code of a command."""
-    with pytest.raises(SystemExit) as ended:
-        main([str(word) for word in words])
-    return ended.value.code
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +186,7 @@ def test_the_choices_of_flags_are_names_that_the_package_knows():
     assert set(POLICIES) == set(tb.planning.POLICIES)
     assert set(OBJECTIVES) == set(tb.planning.OBJECTIVES)
     assert set(FORMATS) == set(ALL_FORMATS)
+    assert [tb.hazard.Hazard(limit=limit).limit for limit in LIMITS] == [*LIMITS]
 
 
 def test_help_imports_nothing_heavy():

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from test_cli import call
+from commands import call
 
 import trustbo as tb
 from trustbo.simulation import KinematicSimulator
