@@ -37,6 +37,9 @@ def test_a_name_is_the_cell_of_the_place(workspace):
     assert again.places["summit"] == workspace.places["the hill"]
     assert again.locate("camp") == (2, 1)
     assert map_name(again) == map_name(workspace)
+    part = workspace.of_robots(["r1"]).with_places({"ford": (1, 1)})
+    assert part.team.names == ("r1",)
+    assert part.places == part.whole.places != workspace.places
 
 
 def test_the_distance_from_the_stop_is_told(workspace):

@@ -329,6 +329,9 @@ class Workspace(Summary):
             >>> workspace = workspace.with_places({"camp": (9, 1), "hill": {"x": x, "y": y}})
             >>> plan = tb.Campaign(workspace).ask("camp", "hill")
         """
+        if self.within is not None:
+            return self.within.with_places(places).of_robots(self.team.names)
+
         require_kind("places", places, Mapping, 'give names with locations, as {"camp": (9, 1)}')
         found = dict(self.places)
         for name, location in places.items():
@@ -336,11 +339,10 @@ class Workspace(Summary):
                 raise TrustboError(
                     f'the name of a place must be a text without "," and "="; got {name!r}.'
                 )
-            self.locate(location, f"place {name!r}")
-            known = isinstance(location, str)
-            found[composed(name)] = (
-                self.places[composed(location)] if known else self.grid.position(location)
-            )
+            what = f"place {name!r}"
+            where = self._place(location, what) if isinstance(location, str) else location
+            self.locate(where, what)
+            found[composed(name)] = self.grid.position(where)
         return dataclasses.replace(self, places=found)
 
     def from_stop(self, name: str) -> float:
