@@ -17,8 +17,8 @@ named `priced`, this is so from the first mission on. In those named `free first
 cost until one has happened. `trustbo, three sets` also has the price from the first mission on, and
 plans with three sets of posts, the default of workspaces; all others have the standard set. Truths
 are those of the standard set, so three sets are compared by the contact lost as missions measure
-it. The baselines do not use a posterior of trust, and none is fitted. The
-residual process and the running mean plan with their means.
+it. The baselines do not use a posterior of trust, and none is fitted. The residual process and the
+running mean plan with their means.
 
 Each campaign has a file in --out, so a run that was stopped continues where it was. With `--rows`,
 no campaign is run, and the tables are those of the means of earlier runs.

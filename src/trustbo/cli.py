@@ -98,13 +98,8 @@ def parser() -> argparse.ArgumentParser:
     add("--dem", type=Path, required=True, metavar="FILE", help="raster of ground heights")
     add("--dsm", type=Path, metavar="FILE", help="raster of surface heights")
     add("--start", type=place, required=True, metavar="LOCATION", help=LOCATION)
-    add(
-        "--goal",
-        type=place,
-        required=True,
-        metavar="LOCATION",
-        help="in the same format as --start",
-    )
+    text = "in the same format as --start"
+    add("--goal", type=place, required=True, metavar="LOCATION", help=text)
     _add_workspace(add)
     add("--policy", choices=POLICIES, help="policy that chooses the paths (default explore)")
     add("--objective", choices=OBJECTIVES, help="objective of the paths (default lost_contact)")
@@ -128,69 +123,63 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_field_commands(command: Callable[..., Any]) -> None:
     """Add the commands for campaigns of real robots."""
-    folder = {"type": Path, "metavar": "FOLDER", "help": "folder of the campaign"}
-    robots = {"type": _names, "metavar": "NAMES", "help": "robots that go, such as alpha,bravo"}
 
-    example = "week --dem dem.tif --dsm dsm.tif --shape 12,10 --max-slope 18 --place camp=9,1"
-    add = command(new, "Begin a campaign of real robots on a ground.", example)
-    add("folder", **folder)
+    def on_folder(run: Callable[..., None], text: str, example: str) -> Any:
+        add = command(run, text, f"week {example}".rstrip())
+        add("folder", type=Path, metavar="FOLDER", help="folder of the campaign")
+        return add
+
+    def add_course(add: Any) -> None:
+        add("start", type=place, metavar="START", help=LOCATION)
+        add("goal", type=place, metavar="GOAL", help="in the same format as START")
+        text = "robots that go, such as alpha,bravo"
+        add("--robots", type=_names, metavar="NAMES", help=text)
+
+    def add_log(add: Any) -> None:
+        add("log", type=Path, metavar="LOG", help="table (CSV), ROS bag, or poses for --detections")
+        add("--detections", type=Path, metavar="FILE", help="detections, if LOG contains poses")
+        add("--tick", type=float, default=1.0, metavar="S", help="seconds of a detector reading")
+        text = "why tracks end early, such as stuck"
+        add("--status", default="aborted", metavar="TEXT", help=text)
+
+    example = "--dem dem.tif --dsm dsm.tif --shape 12,10 --max-slope 18 --place camp=9,1"
+    add = on_folder(new, "Begin a campaign of real robots on a ground.", example)
     add("--dem", type=Path, required=True, metavar="FILE", help="raster of ground heights")
     add("--dsm", type=Path, metavar="FILE", help="raster of surface heights")
     _add_workspace(add)
     add("--names", type=_names, metavar="NAMES", help="names of the robots, such as alpha,bravo")
     text = f"name of a location, such as camp=9,1; repeat it. {LOCATION}"
     add("--place", type=_named_place, action="append", metavar="NAME=LOCATION", help=text)
-    add("--limit", choices=LIMITS, help="how the slope limit is known (default data sheet)")
-    add("--posts", type=int, choices=(1, 3), help="sets of posts of each cell (default 3)")
+    text = "how the slope limit is known (default data sheet)"
+    add("--limit", choices=LIMITS, default="data sheet", help=text)
+    text = "sets of posts of each cell (default 3)"
+    add("--posts", type=int, choices=(1, 3), default=3, help=text)
     add("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
 
-    def add_course(add: Any) -> None:
-        add("start", type=place, metavar="START", help=LOCATION)
-        add("goal", type=place, metavar="GOAL", help="in the same format as START")
-        add("--robots", **robots)
-
-    add = command(field.ask, "Plan the next mission.", "week camp hill --nav2 nav2")
-    add("folder", **folder)
+    add = on_folder(field.ask, "Plan the next mission.", "camp hill --nav2 nav2")
     add_course(add)
     add("--way", type=int, metavar="K", help="take way K of `trustbo ways` instead of the best")
     add("--nav2", type=Path, metavar="DIR", help="folder for the waypoints of Nav2")
     add("--geojson", type=Path, metavar="FILE", help="file for the path")
 
-    add = command(field.ways, "Compare ways by contact, arrival and metres.", "week camp hill")
-    add("folder", **folder)
+    add = on_folder(field.ways, "Compare ways by contact, arrival and metres.", "camp hill")
     add_course(add)
 
-    def add_log(add: Any) -> None:
-        add("log", type=Path, metavar="LOG", help="table (CSV), ROS bag, or poses for --detections")
-        add("--detections", type=Path, metavar="FILE", help="detections, if LOG contains poses")
-        add("--tick", type=float, default=1.0, metavar="S", help="seconds of a detector reading")
-        add(
-            "--status",
-            default="aborted",
-            metavar="TEXT",
-            help="why tracks end early, such as stuck",
-        )
-
-    add = command(field.tell, "Record the log of a mission, and learn from it.", "week log.csv")
-    add("folder", **folder)
+    add = on_folder(field.tell, "Record the log of a mission, and learn from it.", "log.csv")
     add_log(add)
 
-    add = command(field.fail, "Report a mission in which nothing was measured.", "week stuck")
-    add("folder", **folder)
+    add = on_folder(field.fail, "Report a mission in which nothing was measured.", "stuck")
     add("reason", metavar="REASON", help="such as stuck, tipped, or rain")
     add("--where", type=shape, metavar="ROW,COL", help="cell that was not reached")
 
-    add = command(field.correct, "Replace a mission whose log was wrong.", "week 5 right.csv ...")
-    add("folder", **folder)
+    add = on_folder(field.correct, "Replace a mission whose log was wrong.", "5 right.csv ...")
     add("mission", type=_count, metavar="N", help="number of the wrong mission")
     add_log(add)
     add("--reason", required=True, metavar="TEXT", help="why the log was wrong")
 
-    add = command(field.status, "Show the ground and all missions.", "week")
-    add("folder", **folder)
+    add = on_folder(field.status, "Show the ground and all missions.", "")
 
-    add = command(field.report, "Write a report as an HTML page.", "week --out report.html")
-    add("folder", **folder)
+    add = on_folder(field.report, "Write a report as an HTML page.", "--out report.html")
     add("--out", type=Path, default=Path("report.html"), metavar="FILE", help="file to write")
 
 
@@ -278,9 +267,9 @@ def info(args: argparse.Namespace) -> None:
     import trustbo as tb
     from trustbo.files import write_file
 
-    workspace = workspace_of(args)
+    workspace = _workspace(args)
     print(workspace)
-    print(passable_text(workspace))
+    print(_passable(workspace))
     plt.switch_backend("agg")
     tb.plots.grid_map(workspace)
     picture = io.BytesIO()
@@ -304,13 +293,13 @@ def run(args: argparse.Namespace) -> None:
         options = dict(tb.paper.CAMPAIGN)
     given = {"policy": args.policy, "objective": args.objective}
     options |= {name: value for name, value in given.items() if value is not None}
-    workspace = workspace_of(args, {"start": args.start, "goal": args.goal}, **features)
+    workspace = _workspace(args, {"start": args.start, "goal": args.goal}, **features)
     if not args.quiet:
-        print(passable_text(workspace))
+        print(_passable(workspace))
     _run(args, workspace, start=args.start, goal=args.goal, **options, stop=_stop(args))
 
 
-def workspace_of(
+def _workspace(
     args: argparse.Namespace, ends: Mapping[str, Any] | None = None, **features: Any
 ) -> "Workspace":
     """Make the workspace from the flags of `_add_workspace`, after a check of the ends of paths.
@@ -334,7 +323,7 @@ def workspace_of(
     return tb.Workspace.from_terrain(terrain, args.shape, team, **features)
 
 
-def passable_text(workspace: "Workspace") -> str:
+def _passable(workspace: "Workspace") -> str:
     """Return, as text, the robots' slope limit and how many cells are passable with it."""
     from math import degrees
 
@@ -373,13 +362,12 @@ def new(args: argparse.Namespace) -> None:
     """Begin a campaign of real robots, and print the ground."""
     import trustbo as tb
 
-    options = {} if args.posts is None else {"n_posts": args.posts}
-    workspace = workspace_of(args, **options).with_places(dict(args.place or ()))
-    hazard = tb.hazard.Hazard(**({} if args.limit is None else {"limit": args.limit}))
+    workspace = _workspace(args, n_posts=args.posts).with_places(dict(args.place or ()))
+    hazard = tb.hazard.Hazard(limit=args.limit)
     campaign = tb.Campaign(workspace, hazard=hazard, seed=args.seed, directory=args.folder)
     campaign.close()
     print(workspace)
-    print(passable_text(workspace))
+    print(_passable(workspace))
     print(f"the campaign is in {args.folder}; ask it for a course: trustbo ask {args.folder} ...")
 
 

@@ -5,8 +5,6 @@ Each command loads the campaign from its folder, which is locked meanwhile, and 
 """
 
 from argparse import Namespace
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,13 +22,11 @@ _STATUS = ("start", "goal", "robots", "status", "state", "contact_lost", "n_boun
 """Columns of the table that `status` prints."""
 
 
-@contextmanager
-def loaded(folder: Path) -> "Iterator[Campaign]":
-    """Load the campaign of a folder, and close it afterwards."""
+def loaded(folder: Path) -> "Campaign":
+    """Load the campaign of a folder, to be closed at the end of a `with` block."""
     import trustbo as tb
 
-    with tb.Campaign.load(folder, progress=False) as campaign:
-        yield campaign
+    return tb.Campaign.load(folder, progress=False)
 
 
 def ask(args: Namespace) -> None:
@@ -69,7 +65,7 @@ def parts_text(campaign: "Campaign", plan: "Plan") -> str:
     if not problem.objective.of_contact:
         return f"value {plan.value:.2f} ({plan.objective})"
     price = problem.failure_along(plan.stations)
-    lost = -plan.value - price - problem.bound_cost_along(plan.stations)
+    lost = problem.contact_lost(plan.stations, plan.value)
     cost = problem.cost_of_failure
     return (
         f"contact lost: {lost:.2f} of {len(plan.path) - 1} bounds; price of failure: {price:.2f} "

@@ -24,7 +24,7 @@ from trustbo.campaign.settings import (
     to_settings,
 )
 from trustbo.campaign.simulated import require_simulator, run_missions, settings_of
-from trustbo.campaign.state import Entry, Exclusion, Failure, State
+from trustbo.campaign.state import Entry, Failure, State
 from trustbo.campaign.stopping import Stop, require_stop
 from trustbo.data import Cell, Mission, cells_of, require_path
 from trustbo.display import joined, say
@@ -401,25 +401,24 @@ class Campaign(Recorder):
         """
         require_kind("mission", mission, Mission, "give one trustbo.Mission at a time")
         with self._turn:
+            self._require_mission(n, reason)
             entries = self.state.entries
-            before = [entry.exclusion and entry.exclusion.reason for entry in entries]
-            self._require_counts("mission", n, reason, before, "excluded")
-
             plan = entries[n - 1].plan
             mission = self._in_order(mission, plan.robots)
             require_new(self.state, mission)
             reason = f"corrected, see mission {len(entries) + 1}: {reason}"
-            return self._add(mission, plan, {n: reason})
+            return self._add(mission, plan, (n, reason))
 
     def _add(
-        self, mission: Mission, asked: Plan | None, wrong: Mapping[int, str] | None = None
+        self, mission: Mission, asked: Plan | None, wrong: tuple[int, str] | None = None
     ) -> xr.DataTree | None:
         """Record a mission and learn from it.
 
         Args:
             mission: Mission with its robots and features in the order of the workspace.
             asked: Plan of the mission; None if no path was asked for.
-            wrong: Reasons for which other missions are excluded in the same step, by number.
+            wrong: Number of the mission that it corrects, which is excluded in the same step, and
+                the reason; None if it corrects none.
         """
         learned = as_learned(mission, self.workspace, self.state.settings["awareness"])
         if mission.robots != self.workspace.team.names:
@@ -429,11 +428,7 @@ class Campaign(Recorder):
         trust_map = self._trust_map_of(Course.of(plan))
 
         before = self.state
-        entries = list(before.entries)
-        for n, reason in (wrong or {}).items():
-            exclusion = Exclusion(len(entries), reason)
-            entries[n - 1] = replace(entries[n - 1], exclusion=exclusion)
-
+        entries = before.entries if wrong is None else self._excluding(*wrong)
         entry = Entry(plan, mission, learned, trust_map, posterior=before.last)
         recorded = f"mission {len(entries) + 1} is recorded"
         try:

@@ -9,7 +9,7 @@ import xarray as xr
 from trustbo.campaign.folder import FolderStorage, MemoryStorage
 from trustbo.campaign.learning import with_posterior
 from trustbo.campaign.result import Result
-from trustbo.campaign.state import Exclusion, State
+from trustbo.campaign.state import Entry, Exclusion, State
 from trustbo.errors import TrustboError, require_whole, warn
 from trustbo.files import FilePath, holding_interrupts
 from trustbo.inference.learner import Learner
@@ -120,17 +120,23 @@ class Recorder(Result):
                 empty, or the exclusion cannot be recorded. The mission is then not excluded.
         """
         with self._turn:
-            entries = self.state.entries
-            before = [entry.exclusion and entry.exclusion.reason for entry in entries]
-            self._require_counts("mission", n, reason, before, "excluded")
-
+            self._require_mission(n, reason)
             self._learn()
-            entries = list(self.state.entries)
-            exclusion = Exclusion(len(entries), reason)
-            entries[n - 1] = replace(entries[n - 1], exclusion=exclusion)
-            self._record(entries=tuple(entries), asked=None)
+            self._record(entries=self._excluding(n, reason), asked=None)
             self._learn_and_write(f"the exclusion of mission {n} is recorded")
             return self.state.posterior
+
+    def _require_mission(self, n: int, reason: str) -> None:
+        """Raise TrustboError unless mission n counts, and can be excluded for this reason."""
+        before = [entry.exclusion and entry.exclusion.reason for entry in self.state.entries]
+        self._require_counts("mission", n, reason, before, "excluded")
+
+    def _excluding(self, n: int, reason: str) -> tuple[Entry, ...]:
+        """Return the entries, of which mission n is excluded."""
+        entries = list(self.state.entries)
+        exclusion = Exclusion(len(entries), reason)
+        entries[n - 1] = replace(entries[n - 1], exclusion=exclusion)
+        return tuple(entries)
 
     def withdraw(self, n: int, reason: str) -> None:
         """Withdraw a report of `Campaign.fail` that was a mistake; `ask` then plans again.

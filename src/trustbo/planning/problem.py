@@ -177,6 +177,13 @@ class Problem:
             return 0.0
         return self.cost_of_failure * self.risk.failure(path)
 
+    def contact_lost(self, path: Sequence[Station] | np.ndarray, value: float) -> float:
+        """Return the contact lost on a path with this value: without costs of failure and bounds.
+
+        The value is that of the objective lost_contact.
+        """
+        return -value - self.failure_along(path) - self.bound_cost_along(path)
+
     def costs_of_bounds(self, trust: np.ndarray, lost: np.ndarray) -> tuple[np.ndarray, float]:
         """Compute the costs of all bounds as if trust were not carried over; see `Planner.graph`.
 

@@ -143,10 +143,8 @@ def ways_of(planner: Planner, belief: Draws, most: int = MOST) -> Ways:
 
 def _numbers_of(problem: Problem, plan: Plan) -> tuple[float, float, float]:
     """Return the contact lost, the failure probability and the length of a plan."""
-    stations = plan.stations
-    price = problem.failure_along(stations) + problem.bound_cost_along(stations)
-    p_fail = 0.0 if problem.risk is None else problem.risk.failure(stations)
-    return -plan.value - price, p_fail, plan.length
+    p_fail = 0.0 if problem.risk is None else problem.risk.failure(plan.stations)
+    return problem.contact_lost(plan.stations, plan.value), p_fail, plan.length
 
 
 def _lengths(workspace: Workspace) -> np.ndarray:

@@ -57,22 +57,17 @@ def edges_of(workspace: Workspace, n_posts: int = 1) -> list[Edge]:
         ahead = []
         for number, move in (divmod(after, len(MOVES)) for after in nexts):
             next_cell = row + MOVES[move][0], col + MOVES[move][1]
-            ahead.append((_station(row, col, number), next_cell))
+            ahead.append(((row, col, POST_SETS[number]), next_cell))
 
         edge = Edge(
             way,
-            left=_station(row - down, col - right, way // len(MOVES)),
+            left=(row - down, col - right, POST_SETS[way // len(MOVES)]),
             cell=(row, col),
             next_ways=(*nexts, n_ways),
-            ahead=(*ahead, ((row, col), None)),
+            ahead=(*ahead, ((row, col, POST_SETS[0]), None)),
         )
         edges.append(edge)
     return edges
-
-
-def _station(row: int, col: int, number: int) -> Station:
-    """Return a cell with the set of posts of this number; a cell alone has the standard set."""
-    return (row, col, POST_SETS[number]) if number else (row, col)
 
 
 def replicated(simulator: Any, mission: int, n_replicates: int, seed: int) -> xr.Dataset:

@@ -13,8 +13,7 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
-from trustbo.data import POST_SETS, Cell, Station, cells_of
-from trustbo.data import require_path as as_stations
+from trustbo.data import POST_SETS, Cell, Station, cells_of, stations_of
 from trustbo.display import Rows, Summary, announced
 from trustbo.errors import TrustboError, require_count, require_whole
 from trustbo.files import FilePath, to_json, to_path, write_file
@@ -283,14 +282,15 @@ def _most_kept(
 
     # Choose the number of bounds that loses least, and follow the choices from the start.
     n = int(np.argmin(np.arange(1, longest + 1) - np.array(most)))
-    cell = start
+    cells = [start]
+    post_sets: list[str] = []
     way = first[n]
-    path: list[Station] = []
     for choice in [*choices[:n][::-1], None]:
         number, move = divmod(way, len(MOVES))
-        path.append((*cell, POST_SETS[number]))
+        post_sets.append(POST_SETS[number])
+        row, col = cells[-1]
         down, right = MOVES[move]
-        cell = cell[0] + down, cell[1] + right
+        cells.append((row + down, col + right))
         if choice is not None:
-            way = int(choice[way, *cell])
-    return as_stations("path", [*path, cell])
+            way = int(choice[way, *cells[-1]])
+    return stations_of(cells, post_sets)
