@@ -1,68 +1,356 @@
-"""Bounds of a log on a map: the ticks in which the lead enters and leaves the cells of its path."""
+"""Bounds of a log on a map: when the lead leaves its stop in each cell of its path.
 
-from collections.abc import Sequence
-from itertools import groupby
+A bound begins when the lead leaves its stop in a cell, and ends when it leaves the next one; the
+subteam closes up in between. Where the lead halts, it is in the cell of the stop that is near, even
+if its position lies beyond the edge of the cell.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
+from scipy.spatial.distance import cdist
 
 from trustbo.data import Cell, Station, cells_of, require_path
 from trustbo.errors import TrustboError, warn
 from trustbo.logs.poses import GAP, UNITS
-from trustbo.workspace.grid import Grid
+from trustbo.workspace import Workspace
 
 _SHORT = 10.0
 """Length of a log below which its unit of time is doubted, s."""
+_AT_STOP = 5.0
+"""Largest distance of a lead that is at a stop, m."""
+_OF_SIDE = 0.25
+"""The same in small cells, as a part of the shorter side of a cell."""
+_THROUGH = 0.5
+"""Length of a visit, as a part of this side, from which it is not only a corner that is cut."""
+_SLOW = 2.0
+"""Time in which the lead drives out of a circle, at most, as a multiple of that at full speed."""
+_FEW = 5
+"""Number of readings below which a rate is hardly known."""
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """The path of the lead, and when it reached its cells and left its stops.
+
+    Attributes:
+        stations: The planned path, or the driven one.
+        reached: First tick in each cell that was reached, in the order of the path.
+        edges: Tick at which each bound begins, and the end of the last one.
+        is_complete: Whether the last cell was reached, and no bound failed.
+    """
+
+    stations: Sequence[Station]
+    reached: Sequence[int]
+    edges: np.ndarray
+    is_complete: bool
 
 
 def crossings_of(
     places: pd.DataFrame,
     n: int,
     tick: float,
-    grid: Grid,
+    workspace: Workspace,
     planned: Sequence[Station] | None,
-) -> tuple[Sequence[Station], np.ndarray]:
-    """Return the path of the lead (by default, all cells that it enters) and its bounds' edges.
+    *,
+    is_failed: bool,
+) -> Crossings:
+    """Return the path of the lead (by default, the cells that it drives through) and its bounds.
 
-    Entering and leaving follow one rule: a cell is left if the lead does not return within 5 s.
+    Args:
+        places: Known poses of the lead, with columns tick, x and y.
+        n: Number of ticks of the log.
+        tick: Length of a tick, s.
+        workspace: Map of cells and stops.
+        planned: Planned path. If the lead drives round some of its cells, the result has the cells
+            that it drove through instead.
+        is_failed: Whether the bound in which the log ends failed. If the lead is at its stop, this
+            is the bound into its cell, in which T2 closes up, or else the bound out of this cell.
     """
-    located = zip(*grid.cells_at(places["x"].to_numpy(), places["y"].to_numpy()), strict=True)
-    cells = [(int(row), int(col)) if is_on_grid else None for row, col, is_on_grid in located]
-    ticks = places["tick"].tolist()
-    visits = [*zip(ticks, _without_excursions(ticks, cells, GAP / tick), strict=True)]
-
-    entered = [(k, cell) for k, cell in visits if cell is not None]
-    if not entered:
+    lead = _Lead(places, tick, workspace)
+    if not any(lead.cells):
         x, y = places[["x", "y"]].median()
         raise TrustboError(
             f"the lead is never on the grid: its poses are around ({x:.8g}, {y:.8g}). Give x and y "
-            f"in {grid.crs_name}, in which the lower left is {grid.corner}."
+            f"in {workspace.grid.crs_name}, in which the lower left is {workspace.grid.corner}."
         )
 
-    driven = [cell for cell, _ in groupby(cell for _, cell in entered)]
-    stations = require_path("path", driven if planned is None else planned)
+    stations = require_path("path", lead.driven(0, n) if planned is None else planned)
+    if planned is not None and len(stations) < 2:
+        raise TrustboError(f"path must have at least two cells; got {cells_of(stations)}.")
+
+    hint = _doubts_of(lead.ticks.tolist(), n, tick)
+    if planned is not None:
+        stations = _with_detours(stations, lead)
     path = cells_of(stations)
-    if planned is not None and len(path) < 2:
-        raise TrustboError(f"path must have at least two cells; got {path}.")
-
-    edges: list[int] = []
-    for k, cell in entered:
-        if len(edges) < len(path) and cell == path[len(edges)]:
-            edges.append(k)
-
-    _require_route(path, edges, entered, _doubts_of(ticks, n, tick))
+    reached = lead.reached(path)
+    is_complete = len(reached) == len(path)
+    _require_bound(path, reached, lead, hint, is_failed=is_failed)
     if planned is None or path[0] not in path[1:]:
-        is_complete = planned is not None and len(edges) == len(path)
-        _require_one_mission(path[0], edges, entered, tick, is_complete=is_complete)
+        is_read = planned is not None and is_complete
+        _require_one_mission(path[0], reached, lead, tick, is_complete=is_read)
 
-    end = _end_of_visit(visits, edges[-1], path[len(edges) - 1], GAP / tick, n)
-    if len(edges) < len(path) and end < n:
+    last = path[len(reached) - 1]
+    end = lead.end_of_visit([last], reached[-1], n)  # of the visit of the last cell
+    if end < n and len(reached) < len(path):
         warn(
-            f"the lead leaves cell {path[len(edges) - 1]} {end * tick:g} s after the start of the "
-            f"log and never enters the next cell of the path, {path[len(edges)]}; the mission is "
-            "read as ended there."
+            f"the lead leaves cell {last} {end * tick:g} s after the start of the log and never "
+            f"enters the next cell of the path, {path[len(reached)]}; the mission is read as ended "
+            "there."
         )
-    return stations, np.array([*edges[1:], end])
+
+    ends = [*reached[1:], end]
+    edges = [lead.departure(*each) for each in zip(path, reached, ends, strict=False)]
+    if is_failed and (len(reached) == 1 or lead.has_left(last, reached[-1])):
+        if is_complete:
+            raise TrustboError(
+                f"a status is given, but the lead leaves {last}, the last cell of the path, "
+                f"{end * tick:g} s after the start of the log; leave status= out, or end the poses "
+                "where the bound failed."
+            )
+        edges.append(lead.end_of_visit(path[len(reached) - 1 :][:2], reached[-1], n))
+    elif is_failed or end == n:
+        edges[-1] = n  # it is still there
+
+    edges = np.maximum.accumulate(edges)
+    n_ticks = np.diff(edges).tolist()
+    _warn_of_few(path, n_ticks[:-1] if is_failed else n_ticks, tick)
+    return Crossings(stations, reached, edges, is_complete and not is_failed)
+
+
+class _Lead:
+    """Where the lead is, in each tick with a known pose.
+
+    Attributes:
+        ticks: Numbers of these ticks, (pose,).
+        xy: Positions, (pose, 2), m.
+        cells: Cell of each pose, or None off the grid; see `_located` and `_without_excursions`.
+    """
+
+    def __init__(self, places: pd.DataFrame, tick: float, workspace: Workspace) -> None:
+        grid = self._grid = workspace.grid
+        self._side = min(grid.cell_height, grid.cell_width)
+        self._radius = min(_AT_STOP, _OF_SIDE * self._side)
+        self._most = GAP / tick  # number of ticks of an excursion
+        self._drive_out = self._radius / (workspace.team.lead.speed * tick)  # at full speed, ticks
+        self._stop: Callable[[Cell], Any] = (
+            grid.center if workspace.posts is None else workspace.posts.stop
+        )
+
+        self.ticks = places["tick"].to_numpy()
+        self.xy = places[["x", "y"]].to_numpy()
+        self.cells = _without_excursions(self.ticks.tolist(), self._located(), self._most)
+
+    def _located(self) -> list[Cell | None]:
+        """Return the cell of the nearest stop if the lead is there, or else the cell around it."""
+        row, col, is_on_grid = self._grid.cells_at(*self.xy.T)
+        around = np.stack([row, col], axis=1)
+        cells = np.where(is_on_grid[:, None], around, -1)
+        for r, c in np.unique(around, axis=0).tolist():
+            first = max(r - 1, 0), max(c - 1, 0)
+            block = np.ones(self._grid.shape)[first[0] : r + 2, first[1] : c + 2]
+            near = np.argwhere(block) + first
+            stops = [self._stop((i, j)) for i, j in near.tolist()]
+
+            in_cell = np.flatnonzero((around == (r, c)).all(axis=1))
+            away = cdist(self.xy[in_cell], stops)
+            at_stop = away.min(axis=1) <= self._radius
+            cells[in_cell[at_stop]] = near[away.argmin(axis=1)[at_stop]]
+        return [None if i < 0 else (i, j) for i, j in cells.tolist()]
+
+    def entered(self, since: int = 0) -> list[tuple[int, Cell]]:
+        """Return the tick and the cell of each pose on the grid from a tick on."""
+        visits = zip(self.ticks.tolist(), self.cells, strict=True)
+        return [(k, cell) for k, cell in visits if cell is not None and k >= since]
+
+    def reached(self, path: Sequence[Cell]) -> list[int]:
+        """Return the first tick in each cell of a path that is reached, in order."""
+        reached: list[int] = []
+        for k, cell in self.entered():
+            if len(reached) < len(path) and cell == path[len(reached)]:
+                reached.append(k)
+        return reached
+
+    def driven(self, begin: int, end: int) -> list[Cell]:
+        """Return the cells that the lead drives through between two ticks.
+
+        A cell of which it only cuts a corner, on the way between two neighbours, is left out.
+        """
+        poses = self._between(begin, end + 1).tolist()
+        steps = [(cell, i) for i in poses if (cell := self.cells[i]) is not None]
+        visits = [(cell, [i for _, i in of]) for cell, of in groupby(steps, itemgetter(0))]
+
+        k = 1
+        while k < len(visits) - 1:
+            (before, _), (cell, poses_in), (after, _) = visits[k - 1 : k + 2]
+            length = np.linalg.norm(np.ptp(self.xy[poses_in], axis=0))
+            is_cut = (
+                length < _THROUGH * self._side
+                and not self._is_near(self._stop(cell), poses_in).any()
+            )
+            if is_cut and _are_close(before, after):
+                del visits[k]
+            else:
+                k += 1
+        return [cell for cell, _ in groupby(cell for cell, _ in visits)]
+
+    def halts_at(self, cell: Cell, begin: int) -> list[int]:
+        """Return the ticks, from one on, in which the lead is in a cell, and also at its stop."""
+        row, col, _ = self._grid.cells_at(*self.xy.T)
+        poses = np.flatnonzero((row == cell[0]) & (col == cell[1]) & (self.ticks >= begin))
+        return self.ticks[poses[self._is_near(self._stop(cell), poses)]].tolist()
+
+    def has_left(self, cell: Cell, begin: int) -> bool:
+        """Return whether the lead was at the stop of a cell after a tick, and is not in the end."""
+        poses = np.flatnonzero(self.ticks >= begin)
+        is_near = self._is_near(self._stop(cell), poses)
+        return bool(is_near.any() and not is_near[-1])
+
+    def departure(self, cell: Cell, begin: int, end: int) -> int:
+        """Return the tick in which the lead leaves its stop in a cell between two ticks.
+
+        If it does not halt at the stop, it leaves the median of its positions in the cell. It needs
+        as much time to drive out of the circle around the stop as for as many metres beyond it.
+        """
+        place = self._stop(cell)
+        in_cell = self._between(begin, end)
+        if not self._is_near(place, in_cell).any():
+            halts = [i for i in in_cell.tolist() if self.cells[i] == cell]
+            place = np.median(self.xy[halts], axis=0)
+
+        ticks = self.ticks[in_cell[0] :]
+        away = np.linalg.norm(self.xy[in_cell[0] :] - place, axis=1)
+        is_near = away <= self._radius
+        out = np.flatnonzero(~is_near & (ticks >= end))  # after the visit
+        inside = np.flatnonzero(is_near[: out[0] if len(out) else None])
+        if not len(inside):
+            return begin
+
+        left = int(ticks[inside[-1]]) + 1
+        beyond = ticks[(ticks >= left) & (away > 2.0 * self._radius)]
+        drive = beyond[0] - left if len(beyond) else self._drive_out
+        return max(begin, round(left - min(drive, _SLOW * self._drive_out)))
+
+    def end_of_visit(self, cells: Iterable[Cell], begin: int, n: int) -> int:
+        """Return the tick in which the lead leaves some cells for good, or else `n`."""
+        left = None  # tick at which the lead left the cells, until it returns
+        for i in self._between(begin, n).tolist():
+            k = int(self.ticks[i])
+            if self.cells[i] in cells:
+                left = None
+            elif left is None:
+                left = k
+            if left is not None and k - left > self._most:
+                return left
+        return n
+
+    def _between(self, begin: int, end: int) -> np.ndarray:
+        """Return the positions of the poses from one tick until before another, (pose,)."""
+        return np.flatnonzero((self.ticks >= begin) & (self.ticks < end))
+
+    def _is_near(self, place: ArrayLike, poses: Sequence[int] | np.ndarray) -> np.ndarray:
+        """Return whether the lead is in the circle around a place, (pose,)."""
+        return np.linalg.norm(self.xy[poses] - place, axis=1) <= self._radius
+
+
+def _are_close(a: Cell, b: Cell) -> bool:
+    """Return whether two cells are neighbours, or the same."""
+    return max(abs(a[0] - b[0]), abs(a[1] - b[1])) <= 1
+
+
+def _with_detours(stations: Sequence[Station], lead: _Lead) -> Sequence[Station]:
+    """Return a planned path in which cells that the lead drove round are replaced, with a warning.
+
+    If the lead does not return to the path, or does not begin it, the path is as planned.
+    """
+    detours: list[str] = []
+    while True:
+        path = cells_of(stations)
+        reached = lead.reached(path)
+        n = len(reached)
+        if not 0 < n < len(path):
+            break
+
+        further = {*path[n + 1 :]} - {*path[:n]}
+        back = next(((k, cell) for k, cell in lead.entered(reached[-1]) if cell in further), None)
+        if back is None:
+            break
+
+        way = lead.driven(reached[-1], back[0])
+        if not all(_are_close(a, b) for a, b in pairwise(way)):
+            break
+
+        m = path.index(back[1], n)
+        detours.append(f"{', '.join(map(str, way))} and not {', '.join(map(str, path[n:m]))}")
+        stations = (*path[:n], *way[1:-1], *path[m:])
+
+    if detours:
+        warn(
+            f"the lead leaves the planned path: it drives through {'; then '.join(detours)}. The "
+            "mission is read with the cells that it drove through."
+        )
+    return stations
+
+
+def _warn_of_few(path: Sequence[Cell], n_ticks: Sequence[int], tick: float) -> None:
+    """Warn if bounds have so few readings that a rate is hardly known."""
+    few = [k for k, n in enumerate(n_ticks, start=1) if n < _FEW]
+    if few:
+        named = ", ".join(f"{k} into {path[k]}" for k in few if k < len(path))
+        warn(
+            f"bounds of fewer than {_FEW} readings: {named}. A rate of so few is hardly known; "
+            f"check the path, and that the readings are {tick:g} s apart."
+        )
+
+
+def _require_bound(
+    path: Sequence[Cell], reached: Sequence[int], lead: _Lead, hint: str, *, is_failed: bool
+) -> None:
+    """Raise TrustboError if the lead misses a cell of the path, or has no complete bound.
+
+    Args:
+        path: Planned or driven cells.
+        reached: First tick in each cell of the path that is reached in order.
+        lead: Track of the lead.
+        hint: End of the message.
+        is_failed: Whether the last bound, which need not be complete, failed.
+    """
+    n = len(reached)
+    if n == len(path) > 1:
+        return
+
+    entered = lead.entered()
+    if n == len(path):
+        raise TrustboError(
+            f"the lead stays in cell {path[0]} of the path, so there is no complete bound; use "
+            f"`Campaign.fail` if no bound was run.{hint}"
+        )
+
+    later = [
+        cell
+        for _, cell in lead.entered(reached[-1] if reached else 0)
+        if cell in {*path[n + 1 :]} - {*path[:n]}
+    ]
+    if later:
+        raise TrustboError(
+            f"the lead never enters cell {path[n]}, number {n} of the path (0 is the start), but "
+            f"enters {later[0]}, which is further along. Pass the path that was driven, or leave "
+            f"path= out to take it from the poses.{hint}"
+        )
+
+    if n < (1 if is_failed else 2):
+        raise TrustboError(
+            f"the lead never enters cell {path[n]}, number {n} of the path (0 is the start), so "
+            f"there is no complete bound; the log begins in cell {entered[0][1]} and ends in "
+            f"{entered[-1][1]}. Pass the path of this mission, or use `Campaign.fail` if no bound "
+            f"was run.{hint}"
+        )
 
 
 def _doubts_of(ticks: Sequence[int], n: int, tick: float) -> str:
@@ -105,50 +393,10 @@ def _without_excursions(
     return steady
 
 
-def _require_route(
-    path: Sequence[Cell], edges: Sequence[int], entered: Sequence[tuple[int, Cell]], hint: str
-) -> None:
-    """Raise TrustboError if the lead misses a cell of the path, or has no complete bound.
-
-    Args:
-        path: Planned or driven cells.
-        edges: First tick in each cell of the path that is reached in order.
-        entered: Tick and cell of each pose of the lead on the grid.
-        hint: End of the message.
-    """
-    n = len(edges)
-    if n == len(path) > 1:
-        return
-
-    first = entered[0][1]
-    last = entered[-1][1]
-    if n == len(path):
-        raise TrustboError(
-            f"the lead stays in cell {path[0]} of the path, so there is no complete bound; use "
-            f"`Campaign.fail` if no bound was run.{hint}"
-        )
-
-    since = edges[-1] if edges else 0
-    later = [cell for k, cell in entered if k > since and cell in {*path[n + 1 :]} - {*path[:n]}]
-    if later:
-        raise TrustboError(
-            f"the lead never enters cell {path[n]}, number {n} of the path (0 is the start), but "
-            f"enters {later[0]}, which is further along. Pass the path that was driven, or leave "
-            f"path= out to take it from the poses.{hint}"
-        )
-
-    if n < 2:
-        raise TrustboError(
-            f"the lead never enters cell {path[n]}, number {n} of the path (0 is the start), so "
-            f"there is no complete bound; the log begins in cell {first} and ends in {last}. Pass "
-            f"the path of this mission, or use `Campaign.fail` if no bound was run.{hint}"
-        )
-
-
 def _require_one_mission(
     start: Cell,
-    edges: Sequence[int],
-    entered: Sequence[tuple[int, Cell]],
+    reached: Sequence[int],
+    lead: _Lead,
     tick: float,
     *,
     is_complete: bool,
@@ -158,32 +406,20 @@ def _require_one_mission(
     If the planned path is complete before (`is_complete`), what follows is not read, with a
     warning.
     """
-    again = [k for k, cell in entered if k > edges[1] and cell == start]
-    if not again or entered[-1][1] == start:
+    if len(reached) < 2:
+        return
+
+    again = lead.halts_at(start, reached[1])
+    if not again or lead.entered()[-1][1] == start:
         return
 
     text = (
         f"the lead returns to cell {start}, where the path begins, {again[0] * tick:g} s after the "
         "start of the log, and leaves it again"
     )
-    if not is_complete or again[0] < edges[-1]:
+    if not is_complete or again[0] < reached[-1]:
         raise TrustboError(
             f"{text}. Cut the log if it has several missions, or pass the path that was driven if "
             "it leads through its start again."
         )
     warn(f"{text}; only the mission before is read. Cut the log if it has several missions.")
-
-
-def _end_of_visit(
-    visits: Sequence[tuple[int, Cell | None]], begin: int, cell: Cell, most: float, n: int
-) -> int:
-    """Return the tick in which the lead leaves a cell for more than `most` ticks, or else `n`."""
-    left = None  # tick at which the lead left the cell, until it returns
-    for k, at in visits:
-        if k < begin or at == cell:
-            left = None
-        elif left is None:
-            left = k
-        if left is not None and k - left > most:
-            return left
-    return n

@@ -49,11 +49,14 @@ def read_tracks(
     so exchange `watcher` and `seen` in the lead's detections of this phase.
 
     With a workspace, the result is one mission for `Campaign.tell`, with the robots and features of
-    the workspace and without measured awareness. A bound begins where the lead enters the next cell
-    of its path. Excursions of at most 5 s, from which the lead returns to its cell, are ignored. If
-    the planned path is given, a cell whose corner the lead only cuts does not count as a bound. If
-    the lead does not reach the last cell, the mission has the given status. The last bound ends
-    where the lead leaves its cell for more than 5 s.
+    the workspace and without measured awareness. A bound begins when the lead leaves its stop in a
+    cell and ends when it leaves its stop in the next one. The lead is at a stop within 5 m of it
+    (in small cells, a quarter of a side), even beyond an edge of the cell; if it never comes to the
+    stop, it halts at the median of its positions in the cell. A cell is reached when the lead
+    enters it. Excursions of at most 5 s, from which the lead returns to its cell, are ignored, and
+    so is a cell whose corner it only cuts. If the lead drives round planned cells, those that it
+    drove through are read instead. If it does not reach the last cell, the mission has the given
+    status.
 
     Without a workspace, bounds are time windows. The lead is also listed as a robot, with contact
     rates NaN and features 0. All missions therefore have the same robots. A bound without any tick
@@ -74,25 +77,26 @@ def read_tracks(
             without a workspace, every robot is used as the lead in turn.
         window: Length of a bound without a workspace, s.
         tick: Length of a tick, s.
-        status: Why the lead did not reach the last cell of `path`. If it is not `"aborted"`, the
-            bound into the first cell that the lead did not enter failed, and is added to the
-            mission without measurements.
+        status: Why the mission ended before it was complete. If it is not `"aborted"`, the bound
+            in which the poses end failed: the bound into the cell at whose stop the lead is, while
+            T2 closes up, or else the one on which it has left this stop.
 
     Returns:
         One mission for each lead that has a complete bound.
 
     Raises:
         TrustboError: Values, times, poses or units are invalid, the detections have a further
-            column, no detection is between two robots with poses, the lead is unknown, it misses a
-            cell of the given path, it leaves the start twice before it has driven the planned path,
-            a status is given although it reaches the last cell, or the log has no complete bound.
+            column, no detection is between two robots with poses, the lead is unknown, it jumps
+            over a cell of the given path, it leaves the start twice before it has driven the
+            planned path, a status is given although it leaves the last cell, or the log has no
+            complete bound.
 
     Warns:
         UserWarning: A watcher is unknown, detections lie outside the time of the poses, the lead
             detects robots, the interval of detections is not the tick, poses are more than 5 s
             apart, a robot has no poses, is never seen or never watches, the lead leaves the
-            planned path or starts again after it, or T2 stood at the posts of no set, although the
-            workspace has several and the path has none.
+            planned path or starts again after it, a bound has fewer than 5 readings, or T2 stood at
+            the posts of no set, although the workspace has several and the path has none.
 
     Example:
         >>> missions = tb.logs.read_tracks("poses.csv", "detections.csv", window=20.0)
@@ -126,15 +130,18 @@ def read_tracks(
     for name in leads:
         cells = None
         edges = np.arange(0, n + 1, max(round(window / tick), 1))
+        outcome = "ok"
 
         of_name = places.loc[places["robot"] == name]
         if workspace is not None and len(of_name):
-            cells, edges = crossings_of(of_name, n, tick, workspace.grid, path)
-            cells = _with_sets(cells, edges, places, workspace)
+            found = crossings_of(of_name, n, tick, workspace, path, is_failed=status != _ABORTED)
+            cells = _with_sets(found.stations, found.reached[1:], places, workspace)
+            edges = found.edges
+            outcome = "ok" if found.is_complete else status
 
         of_lead = pairs.loc[pairs["lead"] == name]
         if len(edges) > 1 and len(of_lead):
-            missions.append(_mission(of_lead, edges, tick, cells, team, workspace, status))
+            missions.append(_mission(of_lead, edges, tick, cells, team, workspace, outcome))
 
     if not missions:
         usual = tracks.sort_values("t").groupby("robot")["t"].diff().median()
@@ -172,7 +179,7 @@ def _leads(lead: str | None, robots: Sequence[str], workspace: Workspace | None)
 
 
 def _with_sets(
-    path: Sequence[Station], edges: np.ndarray, places: pd.DataFrame, workspace: Workspace
+    path: Sequence[Station], entered: Sequence[int], places: pd.DataFrame, workspace: Workspace
 ) -> Sequence[Station]:
     """Return a path with the sets of posts at which T2 stood when the lead entered each cell.
 
@@ -180,7 +187,7 @@ def _with_sets(
 
     Args:
         path: Planned or driven path.
-        edges: Ticks at which the lead entered each cell after the first one, and the end.
+        entered: Ticks at which the lead entered each cell after the first one.
         places: Poses with columns tick, robot, x and y.
         workspace: Workspace, which may have several sets.
     """
@@ -189,7 +196,6 @@ def _with_sets(
 
     cells = cells_of(path)
     stood = np.full((len(cells) - 1, workspace.team.n_robots, 2), np.nan)
-    entered = edges[:-1]
     by_robot = dict(iter(places.groupby("robot")))
     for i, name in enumerate(workspace.team.names):
         if name in by_robot:
@@ -234,18 +240,7 @@ def _mission(
 ) -> Mission:
     """Make a mission of one lead; `edges` has the first tick of each bound, and then the end."""
     duration = np.diff(edges) * tick
-    if path is None or len(edges) == len(path):
-        if status != _ABORTED:
-            raise TrustboError(
-                f"status={status!r}, but the lead enters the last cell of the path; leave status= "
-                "out, or end the poses where the bound failed."
-            )
-        status = "ok"
-    elif status != _ABORTED:
-        duration = np.append(duration, np.nan)  # of the bound that failed
-
-    pairs = pairs.loc[pairs["tick"] < edges[-1]]  # without the time after the last bound
-    bound = np.searchsorted(edges, pairs["tick"], side="right")
+    bound = np.searchsorted(edges, pairs["tick"], side="right")  # 0 before, and too many after
     groups = pairs.assign(bound=bound).groupby(["bound", "robot"])
     means = {name: (name, "mean") for name in ("contact_rate", *_FEATURES)}
     data = groups.agg(n_ticks=("tick", "count"), **means).to_xarray()
