@@ -125,3 +125,34 @@ def test_a_second_process_is_refused(ground):
         done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "another campaign is using" in done.stderr
+
+
+def test_a_log_with_names_and_units_of_its_own_is_told_as_it_is(ground, tmp_path, capsys):
+    """The mapping is given once, with the ground; the log begins with leg 1 and has positions."""
+    mapping = tmp_path / "columns.toml"
+    mapping.write_text(
+        'mission = "run"\nbound = "leg"\nrobot = "vehicle"\nx = "utm_e"\ny = "utm_n"\n'
+        'contact_rate = {column = "contact_pct", unit = "%"}\n'
+    )
+    maps = [ground / part if part.endswith(".tif") else part for part in MAPS]
+    names = "--names", ",".join(TEAM)
+    folder = tmp_path / "legs"
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text('contact_rate = {column = "contact_pct", unit = "percent"}')
+    assert call("new", folder, *maps, *names, "--columns", wrong) == 1
+    assert not folder.exists()
+    assert call("new", folder, *maps, "--max-slope", 30, *names, "--columns", mapping) == 0
+    assert call("ask", folder, "4,0", "0,4") == 0
+
+    with tb.Campaign.load(folder, progress=False) as campaign:
+        plan = campaign.state.asked
+    rows = ["run,leg,vehicle,utm_e,utm_n,contact_pct,note"]
+    for k, cell in enumerate(plan.path[1:], start=1):
+        x, y = plan.workspace.posts.stop(cell)
+        rows += [f"monday,{k},{name},{x:.2f},{y:.2f},{90.5 - k},dust" for name in TEAM]
+    (tmp_path / "legs.csv").write_text("\n".join(rows))
+    assert call("tell", folder, tmp_path / "legs.csv") == 0
+    assert "mission 1: 4,0 to 0,4, ok" in capsys.readouterr().out
+    with tb.Campaign.load(folder, progress=False) as campaign:
+        rates = campaign.missions[0].contact_rate[:, 0]
+        np.testing.assert_allclose(rates, [(90.5 - k) / 100 for k in range(1, len(plan.path))])

@@ -153,6 +153,8 @@ def _add_field_commands(command: Callable[..., Any]) -> None:
     text = "how the slope limit is known (default data sheet)"
     add("--limit", choices=LIMITS, default="data sheet", help=text)
     text = "sets of posts of each cell (default 3)"
+    text = "TOML file with the names and units of the columns of logs; it is copied"
+    add("--columns", type=Path, metavar="FILE", help=text)
     add("--posts", type=int, choices=(1, 3), default=3, help=text)
     add("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
 
@@ -361,11 +363,16 @@ def _stop(args: argparse.Namespace) -> Any:
 def new(args: argparse.Namespace) -> None:
     """Begin a campaign of real robots, and print the ground."""
     import trustbo as tb
+    from trustbo.files import read_file, write_file
 
     workspace = _workspace(args, n_posts=args.posts).with_places(dict(args.place or ()))
     hazard = tb.hazard.Hazard(limit=args.limit)
+    if args.columns is not None:
+        tb.logs.read_columns(args.columns)  # before anything is written
     campaign = tb.Campaign(workspace, hazard=hazard, seed=args.seed, directory=args.folder)
     campaign.close()
+    if args.columns is not None:
+        write_file(args.folder / field.COLUMNS_FILE, read_file(args.columns))
     print(workspace)
     print(_passable(workspace))
     print(f"the campaign is in {args.folder}; ask it for a course: trustbo ask {args.folder} ...")

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _BAG = (".bag", ".mcap", ".db3")
 """Endings of the files of a ROS bag; that of ROS 2 may also be a folder."""
+COLUMNS_FILE = "columns.toml"
+"""File in the folder of a campaign with the columns of its logs; see `logs.read_columns`."""
 _STATUS = ("start", "goal", "robots", "status", "state", "contact_lost", "n_bounds", "reason")
 """Columns of the table that `status` prints."""
 
@@ -143,6 +145,8 @@ def _missions_in(args: Namespace, workspace: "Workspace", plan: "Plan | None") -
     """Read the missions of the log that the arguments name; tracks need the plan of the mission."""
     from trustbo import logs
 
+    file = args.folder / COLUMNS_FILE
+    columns = logs.read_columns(file) if file.exists() else None
     if args.detections is not None:
         if plan is None:
             raise TrustboError(
@@ -150,10 +154,12 @@ def _missions_in(args: Namespace, workspace: "Workspace", plan: "Plan | None") -
                 "`trustbo ask` first."
             )
         options: dict[str, Any] = {"path": plan.path, "tick": args.tick, "status": args.status}
+        options["columns"] = columns
         return logs.read_tracks(args.log, args.detections, workspace, **options)
     if args.log.suffix in _BAG or args.log.is_dir():
         return logs.read_bag(args.log, workspace)
-    return logs.read_table(args.log)
+    path = None if plan is None else plan.path
+    return logs.read_table(args.log, columns=columns, workspace=workspace, path=path)
 
 
 def _print_last(campaign: "Campaign") -> None:

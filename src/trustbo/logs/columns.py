@@ -13,6 +13,7 @@ import pandas as pd
 
 from trustbo.errors import TrustboError, composed, one_line, see
 from trustbo.files import FilePath, read_file
+from trustbo.logs.mapping import ColumnMap, mapped, require_columns
 
 _BLANK = ("", "na", "n/a", "#n/a", "#na", "nan", "nat", "none", "null", "<na>")
 """Markers of missing values, in lower case, as written by R, Excel, pandas and SQL."""
@@ -55,13 +56,22 @@ class Columns:
     Attributes:
         what: Name of the table in messages, such as "the table of poses".
         frame: Table; blank text cells are None. The index counts rows from 1 below the header.
+        unread: Names of the columns that the mapping does not name.
     """
 
-    def __init__(self, table: Any, what: str = "the table", *, may_be_empty: bool = False) -> None:
+    def __init__(
+        self,
+        table: Any,
+        what: str = "the table",
+        *,
+        columns: ColumnMap | None = None,
+        may_be_empty: bool = False,
+    ) -> None:
         """Read a CSV file (commas, semicolons or tabs), or any table that pandas accepts.
 
-        Tables of xarray, polars and pyarrow are converted. Raises TrustboError if a file or value
-        is not a table, a column is repeated, or there are no rows although `may_be_empty` is False.
+        Tables of xarray, polars and pyarrow are converted. With `columns`, only these columns are
+        read; see `mapping`. Raises TrustboError if a file or value is not a table, a column is
+        repeated, or there are no rows although `may_be_empty` is False.
         """
         self.what = what
         is_file = isinstance(table, str | PathLike)
@@ -83,9 +93,16 @@ class Columns:
 
         # Qualtrics exports repeat the header in prose and then as JSON with "ImportId".
         imports = [i for i, row in frame.iloc[:3].iterrows() if "ImportId" in str(row.tolist())]
-        self.frame = frame.loc[max(imports, default=0) + 1 :].dropna(how="all")
+        self.frame: pd.DataFrame = frame.loc[max(imports, default=0) + 1 :].dropna(how="all")
         if self.frame.empty and not may_be_empty:
             raise TrustboError(f"{what} has no rows.")
+
+        self.unread: list[str] = []
+        if columns is not None:
+            given = require_columns(columns)
+            read = {one["column"] for one in given.values()}
+            self.unread = [name for name in self.frame if name not in read]
+            self.frame = mapped(self.frame, given, what)
 
     def find(self, name: str) -> str | None:
         """Return the name of a column as spelled in the table; None if there is no such column."""
@@ -171,7 +188,8 @@ class Columns:
                 f"{self.what} lacks {column}; it has {there}. Choose or rename one, and "
                 f"{see('howto/your-own-robots')}."
             )
-        return pd.Series(np.nan, self.frame.index) if name is None else self.frame[name]
+        blank = pd.Series(np.nan, self.frame.index)
+        return blank if name is None else pd.Series(self.frame[name])
 
 
 def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:

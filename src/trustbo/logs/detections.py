@@ -8,7 +8,10 @@ import pandas as pd
 
 from trustbo.errors import TrustboError, warn
 from trustbo.logs.columns import Columns, require_one_spelling, seconds_of
+from trustbo.logs.mapping import ColumnMap, require_columns
 from trustbo.logs.poses import GAP
+from trustbo.logs.positions import with_metres
+from trustbo.workspace.grid import Grid
 
 _OUTSIDE = 0.05
 """Share of a robot's detections that may be at times without poses without a warning."""
@@ -24,8 +27,14 @@ _REGULAR = 0.9
 """Least time between nearly all detections of a regular detector, in its intervals."""
 _LEAST_SINGLE = 0.2
 """Least share of the times between detections that are one interval of the detector."""
+_POSES = ("t", "robot", "x", "y", "lon", "lat", "heading")
+"""Columns of a table of poses, as far as it has them."""
 _READ = ("t", "watcher", "seen")
 """Columns of a table of detections."""
+_DETECTED = "detected"
+"""Column of a mapping that says whether a row is a detection."""
+_YES = ("true", "1", "yes")
+_NO = ("false", "0", "no")
 _MANY = 4
 """Number of detections that may have another cause, such as a tree or a repeated message."""
 _NEARBY = 21
@@ -38,14 +47,26 @@ _LEAST_EXTENT = 0.1
 """Extent of all poses below which their unit is doubted, m."""
 
 
-def read_tables(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+def read_tables(
+    poses: Any, detections: Any, columns: ColumnMap | None = None, grid: Grid | None = None
+) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
     """Read poses (t, robot, x, y, heading), and detections (t, robot, lead).
+
+    With a grid, poses may have lon and lat in degrees instead of x and y.
 
     Returns the poses, the detections between two robots with poses, and all other detections.
     """
-    where = Columns(poses, "the table of poses")
-    seen = Columns(detections, "the table of detections", may_be_empty=True)
+    given = None if columns is None else require_columns(columns)
+    of_poses, of_seen = (
+        None if given is None else {name: given[name] for name in names if name in given}
+        for names in (_POSES, (*_READ, _DETECTED))
+    )
+    where = Columns(poses, "the table of poses", columns=of_poses)
+    seen = Columns(detections, "the table of detections", columns=of_seen, may_be_empty=True)
+    if of_seen is not None and _DETECTED in of_seen:
+        _drop_misses(seen)
     _require_detections(seen)
+    with_metres(where, grid)
     t, seen_at = seconds_of(where, seen)
     tracks = pd.DataFrame({"t": t, "robot": where.texts("robot", blank=False)})
     tracks["x"] = where.numbers("x", blank=False)
@@ -69,6 +90,13 @@ def read_tables(poses: Any, detections: Any) -> tuple[pd.DataFrame, pd.DataFrame
     return tracks, between, looks.loc[~known]
 
 
+def _drop_misses(table: Columns) -> None:
+    """Keep the rows in which a column says that the robot was detected, without this column."""
+    texts = np.array([text.lower() for text in table.texts(_DETECTED, blank=False)], dtype=str)
+    table.refuse(_DETECTED, ~np.isin(texts, (*_YES, *_NO)), "is neither true nor false")
+    table.frame = table.frame.loc[np.isin(texts, _YES)].drop(columns=[_DETECTED])
+
+
 def _require_detections(table: Columns) -> None:
     """Raise TrustboError for a further column, which may mark rows that are no detections.
 
@@ -76,7 +104,9 @@ def _require_detections(table: Columns) -> None:
     """
     read = [table.find(name) for name in _READ]
     others = [name for name in table.frame if name not in read]
-    further = [name for name in others if not _numbers_rows(table.frame[name])]
+    further = [
+        name for name in others if not _numbers_rows(pd.Series(table.frame[name]))
+    ] + table.unread
     if further:
         raise TrustboError(
             f"{table.what} also has {_listed(further)}, but every row counts as a detection; keep "

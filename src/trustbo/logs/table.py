@@ -7,10 +7,22 @@ import numpy as np
 import pandas as pd
 
 from trustbo.arrays import without_rounding
-from trustbo.data import FEATURES, POST_SETS, SHARE_TOLERANCE, Mission
+from trustbo.data import (
+    FEATURES,
+    POST_SETS,
+    SHARE_TOLERANCE,
+    Cell,
+    Mission,
+    Station,
+    cells_of,
+    require_path,
+)
 from trustbo.errors import TrustboError
 from trustbo.logs.columns import Columns, folded, require_one_spelling, require_plain_names
+from trustbo.logs.mapping import ColumnMap
+from trustbo.logs.positions import with_cells, with_durations
 from trustbo.stacking import require_same_team
+from trustbo.workspace import Workspace
 
 KEYS = ("mission", "bound", "robot")
 RATES = ("contact_rate", "duration", "n_ticks")
@@ -85,7 +97,13 @@ def to_frame(missions: Iterable[Mission]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*names, *missions[0].features])
 
 
-def read_table(table: Any) -> list[Mission]:
+def read_table(
+    table: Any,
+    *,
+    columns: ColumnMap | None = None,
+    workspace: Workspace | None = None,
+    path: Sequence[Station] | None = None,
+) -> list[Mission]:
     """Read missions, without ticks, from a table with one row per mission, bound and robot.
 
     The columns are `mission`; `bound` (0 for the start cell, which has no measurements); `robot`;
@@ -99,33 +117,54 @@ def read_table(table: Any) -> list[Mission]:
     rates have been rounded, each one is read as the nearest multiple of 1 / n_ticks within half a
     unit of the column's last decimal.
 
+    With a workspace, positions may stand for cells: `x` and `y` in metres, `lon` and `lat` in
+    degrees, or `place`, the name of a place. Times `begin` and `end` may stand for `duration`.
+
     Args:
         table: Path of a CSV file (commas, semicolons or tabs), a DataFrame, or a mapping of lists.
+        columns: Names of the table's columns, keyed by the names above. A value is a name, or has
+            `column`, `unit` (%, s, ms, us, ns, min, h, m, cm, km, ft, or date) and, for dates,
+            `zone`, such as `"America/Los_Angeles"`; the default zone is UTC. Other columns of the
+            table are then ignored.
+        workspace: Map of the cells in which positions lie.
+        path: Planned path, such as `campaign.ask().path`, whose first cell is the start of missions
+            with bounds that are numbered from 1.
 
     Returns:
         Missions in the order of the table.
 
     Raises:
         TrustboError: A column, bound or robot is missing, a row is repeated, a value has the wrong
-            type, rows of one bound disagree on its cell, or `Mission` rejects the data.
+            type, a position is outside the workspace, a mapping of columns is invalid, rows of one
+            bound disagree on its cell, or `Mission` rejects the data.
 
     Example:
         >>> missions = tb.logs.read_table("log.csv")
+        >>> missions = tb.logs.read_table(
+        ...     "legs.csv", columns={"bound": "leg", "contact_rate": {"column": "pct", "unit": "%"}}
+        ... )
         >>> posterior = tb.fit(missions, workspace=workspace)
     """
-    columns = Columns(table)
-    known = [columns.find(name) for name in (*COLUMNS, *TRUST)]
-    features = [name for name in columns.frame if name not in known] or list(FEATURES)
+    given = Columns(table, columns=columns)
+    with_cells(given, workspace)
+    with_durations(given)
+    known = [given.find(name) for name in (*COLUMNS, *TRUST)]
+    features = [name for name in given.frame if name not in known] or list(FEATURES)
     odd = {*_NO_FEATURES} & {*map(str.lower, features)}
     if odd:
-        raise TrustboError(f"{sorted(odd)} are no features; drop them, and give cells as row, col.")
+        raise TrustboError(
+            f"{sorted(odd)} are no features; drop them, and give cells as row, col, or pass "
+            "workspace= for positions."
+        )
 
-    frame = _parsed(columns, features)
+    frame = _parsed(given, features)
     robots = tuple(name for name in frame["robot"].unique() if name)
     require_one_spelling("column robot", robots)
-    columns.refuse("bound", frame.duplicated([*KEYS]).to_numpy(), "is repeated for its robot")
+    given.refuse("bound", frame.duplicated([*KEYS]).to_numpy(), "is repeated for its robot")
     nameless = (frame["robot"] == "") & frame["contact_rate"].notna()
-    columns.refuse("contact_rate", nameless.to_numpy(), "has no robot; 'NA' and 'none' are blank")
+    given.refuse("contact_rate", nameless.to_numpy(), "has no robot; 'NA' and 'none' are blank")
+    if path is not None:
+        frame = _with_start(frame, cells_of(require_path("path", path))[0])
 
     missions = []
     for label, rows in frame.groupby("mission", sort=False):
@@ -134,6 +173,17 @@ def read_table(table: Any) -> list[Mission]:
         except TrustboError as error:
             raise TrustboError(f"mission {label}: {error}") from None
     return missions
+
+
+def _with_start(frame: pd.DataFrame, start: Cell) -> pd.DataFrame:
+    """Return a table in which missions with bounds from 1 on also have bound 0, in a cell."""
+    of_mission = frame.groupby("mission", sort=False)
+    lacks = (of_mission["bound"].transform("min") == 1) & ("row" in frame)
+    first = frame.loc[lacks & (frame["bound"] == 1)].copy()
+    measured = [name for name in frame if name not in (*KEYS, "row", "col", POSTS, "status")]
+    first[measured] = np.nan
+    first = first.assign(bound=0, row=start[0], col=start[1], status="", **{POSTS: POST_SETS[0]})
+    return pd.concat([first, frame]) if len(first) else frame
 
 
 def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:

@@ -16,6 +16,7 @@ from trustbo.logs.detections import (
     warn_of_names,
     warn_of_times,
 )
+from trustbo.logs.mapping import ColumnMap
 from trustbo.logs.poses import GAP, UNITS, poses_at, track_of
 from trustbo.workspace import Workspace
 
@@ -38,6 +39,7 @@ def read_tracks(
     window: float = 20.0,
     tick: float = 1.0,
     status: str = _ABORTED,
+    columns: ColumnMap | None = None,
 ) -> list[Mission]:
     """Read a log of poses and detections as missions, one for each lead, which all robots watch.
 
@@ -65,9 +67,10 @@ def read_tracks(
     log, and `ahead` is whether the lead is within 30 degrees of the heading.
 
     Args:
-        poses: Path of a CSV file, a DataFrame, or a mapping of columns: t (s), robot, x, y (m) and,
-            if known, heading (rad from east, anticlockwise); by default, the heading is the
-            direction of motion. Headings are used only without a workspace.
+        poses: Path of a CSV file, a DataFrame, or a mapping of columns: t (s), robot, x, y (m; or
+            lon, lat in degrees with a workspace) and, if known, heading (rad from east,
+            anticlockwise); by default, the heading is the direction of motion. Headings are used
+            only without a workspace.
         detections: Table in any of the same forms with the columns t (on the same clock), watcher
             and seen. Each row is a detection, so further columns are refused. Detections of objects
             without poses are ignored. A table without rows means that no robot detected another.
@@ -80,6 +83,7 @@ def read_tracks(
         status: Why the mission ended before it was complete. If it is not `"aborted"`, the bound
             in which the poses end failed: the bound into the cell at whose stop the lead is, while
             T2 closes up, or else the one on which it has left this stop.
+        columns: Names and units of the columns in both tables, as for `read_table`.
 
     Returns:
         One mission for each lead that has a complete bound.
@@ -110,7 +114,8 @@ def read_tracks(
     if require_choice("status", status, STATUSES[1:]) != _ABORTED and path is None:
         raise TrustboError(f"status={status!r} needs path=, with the cell that was not reached.")
 
-    tracks, looks, unknown = read_tables(poses, detections)
+    grid = None if workspace is None else workspace.grid
+    tracks, looks, unknown = read_tables(poses, detections, columns, grid)
     robots = tuple(tracks["robot"].unique())
     team = robots if workspace is None else workspace.team.names
     leads = _leads(lead, robots, workspace)
