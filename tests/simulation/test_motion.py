@@ -9,7 +9,7 @@ from worlds import Steady
 
 from trustbo.simulation.motion import drive
 from trustbo.team import Robot
-from trustbo.workspace.pursuit import Driving, tilt_along
+from trustbo.workspace.pursuit import Driving, tilts_along
 from trustbo.workspace.routes import Routes
 from trustbo.workspace.surface import Surface
 
@@ -80,8 +80,34 @@ def test_the_largest_tilt_is_that_of_a_drive_without_slip():
     left = np.stack([-heading[1], heading[0]])
     tilts = [np.abs((slopes * axis).sum(0)).max() for axis in (heading, left)]
     place = surface.gradient, surface.pixel, surface.origin
-    largest = tilt_along(*place, route, Driving.of(Robot()))
+    driving = Driving.of(Robot())
+    (largest,) = tilts_along(*place, route, np.array([0, 3]), driving)
     assert largest == pytest.approx(max(tilts), rel=0.03)
+
+
+def test_routes_that_begin_alike_have_the_tilts_of_each_route_alone():
+    """Steps down and to the right at random; two routes turn off, and others end early."""
+    rng = np.random.default_rng(2)
+    surface = flat_surface()
+    surface.gradient[:] = ndimage.gaussian_filter(rng.normal(size=(2, 60, 60)), (0, 2, 2))
+    trunk = np.array([5.0, -5.0]) + np.cumsum(
+        rng.permutation([[1.0, 0.0], [0.0, -1.0]] * 20), axis=0
+    )
+    routes = [trunk[:n] for n in (40, 1, 0, 2, 25, 40)]
+    routes += [
+        np.concatenate([trunk[:n], trunk[n - 1] + [[1.0, -1.0], [2.0, -2.0]]]) for n in (9, 30)
+    ]
+
+    place = surface.gradient, surface.pixel, surface.origin
+    driving = Driving.of(Robot(turn_rate=0.5))
+    first = np.cumsum([0, *map(len, routes)])
+    together = tilts_along(*place, np.concatenate(routes), first, driving)
+    alone = [
+        tilts_along(*place, route.copy(), np.array([0, len(route)]), driving) for route in routes
+    ]
+    np.testing.assert_array_equal(together, np.concatenate(alone))
+    assert np.isnan(together[2])
+    assert len(np.unique(together)) > 3
 
 
 def test_steeper_is_slower():

@@ -31,7 +31,7 @@ def drive(
     """
     steepest = math.tan(robot.max_slope)
     limits = robot.speed, robot.turn_rate, robot.lookahead, robot.max_slope, steepest
-    poses, code, _ = pursue(
+    poses, code = pursue(
         surface.gradient,
         surface.pixel,
         surface.origin,

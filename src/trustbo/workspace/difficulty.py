@@ -27,8 +27,8 @@ from trustbo.parallel import in_order, plain
 from trustbo.team import Robot
 from trustbo.workspace.moves import MOVES, by_option, by_way, options_of, possible_next
 from trustbo.workspace.posts import Posts
-from trustbo.workspace.pursuit import Driving, tilt_along
-from trustbo.workspace.routes import SLACK, same_way, search
+from trustbo.workspace.pursuit import Driving, tilts_along
+from trustbo.workspace.routes import SLACK, framed, same_way, search
 
 MEASURES = ("untraversable", "tilt", "narrowness", "tightness")
 """Measures of difficulty; see `Difficulty`."""
@@ -62,10 +62,10 @@ class Difficulty:
 
     `untraversable` is one minus the mean traversability of a route's pixels, or 0.5 if unknown.
     `tilt` is the largest tangent of pitch or roll on the curve that a robot drives along the route
-    (see `pursuit.tilt_along`), divided by the tangent of `max_slope`; it is at most 2. `narrowness`
-    is 1 / (1 + w / 2 m), where w is the smallest distance to an impassable pixel. `tightness` is
-    log(1 + l / 1 m) / 3, where l is the length of the route beside impassable pixels. All measures
-    are averaged over the options of a unit, which have the same tilt.
+    (see `pursuit.tilts_along`), divided by the tangent of `max_slope`; it is at most 2.
+    `narrowness` is 1 / (1 + w / 2 m), where w is the smallest distance to an impassable pixel.
+    `tightness` is log(1 + l / 1 m) / 3, where l is the length of the route beside impassable
+    pixels. All measures are averaged over the options of a unit, which have the same tilt.
 
     Attributes:
         exists: Whether each bound exists and can be followed by the next way, shape (way, row, col,
@@ -244,38 +244,28 @@ def _of_routes(pace, rasters, place, driving, windows, starts, goals, exists):
     """
     start, from_pixel = starts
     goal, to_pixel = goals
-    pixel, _ = place
     measured = np.full((*start.shape[:2], exists.shape[1], 4), np.nan)
 
     for b in range(len(exists)):
-        top, bottom, left, right = windows[b]
-        within = pace[top:bottom, left:right].copy()
-        nexts = [n for n in range(exists.shape[1]) if exists[b, n]]
+        within = framed(pace, windows[b])
+        corner = windows[b, 0] - 1, windows[b, 2] - 1
+        # Sets of posts and next ways share many routes.
+        nexts = [n for n in range(exists.shape[1]) if exists[b, n] and _first(goal[b], n) == n]
         ends = np.empty((len(nexts), 2), np.int64)
         for k in range(len(nexts)):
-            ends[k, 0] = to_pixel[b, nexts[k], 0] - top
-            ends[k, 1] = to_pixel[b, nexts[k], 1] - left
+            ends[k, 0] = to_pixel[b, nexts[k], 0] - corner[0]
+            ends[k, 1] = to_pixel[b, nexts[k], 1] - corner[1]
 
         for s in range(start.shape[1]):
-            same = _first(start[b], s)  # sets of posts and next ways share many routes
-            if same < s:
-                for n in nexts:
-                    _copy(measured[b, same, n], measured[b, s, n])
-                continue
-
-            begin = from_pixel[b, s, 0] - top, from_pixel[b, s, 1] - left
-            best, came = search(within, pixel, begin, ends, SLACK)
-            for k in range(len(nexts)):
-                n = nexts[k]
-                same = _first(goal[b], n)
-                if same < n:
-                    _copy(measured[b, s, same], measured[b, s, n])
-                    continue
-
-                way = same_way(within, pixel, best, came, begin, (ends[k, 0], ends[k, 1]))
-                if len(way) > 0:
-                    across = start[b, s], goal[b, n]
-                    _of_way(way, (top, left), across, rasters, place, driving, measured[b, s, n])
+            same = _first(start[b], s)
+            if same == s:
+                begin = from_pixel[b, s, 0] - corner[0], from_pixel[b, s, 1] - corner[1]
+                ways = _ways(within, place[0], begin, ends)
+                across = start[b, s], goal[b]
+                _of_ways(ways, nexts, corner, across, rasters, place, driving, measured[b, s])
+            for n in range(exists.shape[1]):
+                if exists[b, n]:
+                    _copy(measured[b, same, _first(goal[b], n)], measured[b, s, n])
     return measured
 
 
@@ -290,52 +280,85 @@ def _first(positions, k):
 
 @_part
 def _copy(values, out):
-    """Copy the measures of a route; numba compiles an assignment of slices for three seconds."""
+    """Copy an array; numba compiles an assignment of slices for three seconds."""
     for i in range(len(out)):
         out[i] = values[i]
 
 
 @_part
-def _of_way(way, corner, across, rasters, place, driving, out):
+def _ways(pace, pixel, start, goals):
+    """Return the pixels (point, 2) of the routes to all goals, empty if there is none."""
+    best, came = search(pace, pixel, start, goals, SLACK)
+    return [
+        same_way(pace, pixel, best, came, start, (goals[k, 0], goals[k, 1]))
+        for k in range(len(goals))
+    ]
+
+
+@_part
+def _of_ways(ways, nexts, corner, across, rasters, place, driving, out):
+    """Write the measures of a robot's routes from one position to `out` (goal, measure).
+
+    Args:
+        ways: Pixels of the routes, in a window that begins at the pixel `corner`.
+        nexts: Index of the goal of each route.
+        corner: Row and column.
+        across: First position of all routes, and the positions of the goals.
+        rasters: See `_of_routes`.
+        place: See `_of_routes`.
+        driving: Parameters of the robot.
+        out: Measures.
+    """
+    pixel, origin = place
+    first = np.zeros(len(ways) + 1, np.int64)
+    for k in range(len(ways)):  # a route within a pixel has two points
+        first[k + 1] = first[k] + (2 if len(ways[k]) == 1 else len(ways[k]))
+
+    flat = np.empty((first[-1], 2))
+    for k in range(len(ways)):
+        way = ways[k]
+        for i in range(1, len(way) - 1):
+            flat[first[k] + i, 0] = origin[0] + (way[i, 1] + corner[1]) * pixel[1]
+            flat[first[k] + i, 1] = origin[1] - (way[i, 0] + corner[0]) * pixel[0]
+        if len(way) > 0:
+            _copy(across[0], flat[first[k]])
+            _copy(across[1][nexts[k]], flat[first[k + 1] - 1])
+
+    tilts = tilts_along(rasters[2], pixel, origin, flat, first, driving)
+    for k in range(len(ways)):
+        if len(ways[k]) > 0:
+            tilt = min(tilts[k] / math.tan(driving[3]), _MOST)
+            _of_way(ways[k], corner, rasters, pixel, tilt, out[nexts[k]])
+
+
+@_part
+def _of_way(way, corner, rasters, pixel, tilt, out):
     """Write the measures of a robot's route to `out` (measure,).
 
     Args:
         way: Pixels of the route, shape (point, 2), in a window that begins at the pixel `corner`.
         corner: Row and column.
-        across: First and last position of the route.
-        rasters: See `_of_robot`.
-        place: See `_of_robot`.
-        driving: Parameters of the robot.
+        rasters: See `_of_routes`.
+        pixel: Size of a pixel.
+        tilt: The measure tilt.
         out: Measures.
     """
-    easy, room, gradient = rasters
-    pixel, origin = place
-    max_slope = driving[3]
-
-    n = max(len(way), 2)  # a route within a pixel has two points
-    route = np.empty((n, 2))
+    easy, room, _ = rasters
     known = 0
     total = 0.0
     gap = np.inf
     n_beside = 0
-    for k in range(n):
+    for k in range(max(len(way), 2)):  # a route within a pixel has two points
         r = way[min(k, len(way) - 1), 0] + corner[0]
         c = way[min(k, len(way) - 1), 1] + corner[1]
-        route[k, 0] = origin[0] + c * pixel[1]
-        route[k, 1] = origin[1] - r * pixel[0]
         if math.isfinite(easy[r, c]):
             known += 1
             total += easy[r, c]
         gap = min(gap, room[r, c])
         n_beside += room[r, c] <= _BESIDE * max(pixel[0], pixel[1])
 
-    for axis in range(2):
-        route[0, axis] = across[0][axis]
-        route[n - 1, axis] = across[1][axis]
-
-    tilt = tilt_along(gradient, pixel, origin, route, driving)
     out[0] = 1.0 - total / known if known > 0 else _UNKNOWN
-    out[1] = min(tilt / math.tan(max_slope), _MOST)
+    out[1] = tilt
     out[2] = 1.0 / (1.0 + gap / _WIDTH)
     out[3] = math.log1p(n_beside * min(pixel[0], pixel[1])) / _TIGHT
 

@@ -5,7 +5,6 @@ between two pixels therefore exists if and only if they are in the same region: 
 diagonally between two impassable pixels or cut the corner of one.
 """
 
-import heapq
 import math
 from typing import Any
 
@@ -13,7 +12,6 @@ import numpy as np
 from scipy import ndimage
 
 from trustbo.kernels import kernel, part
-from trustbo.parallel import plain
 from trustbo.team import Robot
 from trustbo.terrain.pixels import nearest_pixel
 from trustbo.workspace.surface import Surface
@@ -95,15 +93,14 @@ class Routes:
         """Find the pixels of a route, and return their positions; empty if there is no route."""
         surface = self._surface
         top, bottom, left, right = window
-        pixels = a_star(
-            plain(self.pace(max_slope)[top:bottom, left:right]),
+        pace = self.pace(max_slope)[top:bottom, left:right]
+        row, col = a_star(
+            np.pad(pace, 1, constant_values=np.inf),
             surface.pixel,
-            (start[0] - top, start[1] - left),
-            (goal[0] - top, goal[1] - left),
-        )
-
-        row, col = pixels.T
-        return surface.centers(row + top, col + left)
+            (start[0] - top + 1, start[1] - left + 1),
+            (goal[0] - top + 1, goal[1] - left + 1),
+        ).T
+        return surface.centers(row + top - 1, col + left - 1)
 
 
 @_compiled
@@ -113,42 +110,135 @@ def speed_share(tilt, max_slope):
 
 
 @_part
-def _away(r, c, box, pixel, diagonal):
-    """Compute the length of the shortest way from a pixel to a rectangle of pixels.
-
-    A way leads from a pixel to one of its 8 neighbours, so it is longer than a straight line. `box`
-    contains the first and the last row, and the first and the last column. `diagonal` is that of a
-    pixel.
-    """
-    down = max(box[0] - r, 0, r - box[1])
-    right = max(box[2] - c, 0, c - box[3])
-    n_diagonal = min(down, right)
-    straight = (down - n_diagonal) * pixel[0] + (right - n_diagonal) * pixel[1]
-    return n_diagonal * diagonal + straight
+def framed(pace, window):
+    """Return a window of a map of paces with a frame of impassable pixels, one pixel wide."""
+    top, bottom, left, right = window
+    within = np.full((bottom - top + 2, right - left + 2), np.inf)
+    for r in range(top, bottom):
+        for c in range(left, right):
+            within[r - top + 1, c - left + 1] = pace[r, c]
+    return within
 
 
 @_part
-def _step(dr, dc, pixel, diagonal):
-    """Return the distance from a pixel to one of its 8 neighbours."""
-    if dr != 0 and dc != 0:
-        return diagonal
-    return pixel[0] if dr != 0 else pixel[1]
+def _least_ahead(pace, pixel, box):
+    """Compute a lower limit on the cost of the way from each pixel to a rectangle, flat.
+
+    A way leads from a pixel to one of its 8 neighbours, so it is longer than a straight line. `box`
+    contains the first and the last row, and the first and the last column.
+    """
+    rows, cols = pace.shape
+    diagonal = math.hypot(pixel[0], pixel[1])
+    least = np.inf
+    for r in range(rows):
+        for c in range(cols):
+            least = min(least, pace[r, c])
+
+    ahead = np.empty(rows * cols)
+    for r in range(rows):
+        down = max(box[0] - r, 0, r - box[1])
+        for c in range(cols):
+            right = max(box[2] - c, 0, c - box[3])
+            n_diagonal = min(down, right)
+            straight = (down - n_diagonal) * pixel[0] + (right - n_diagonal) * pixel[1]
+            ahead[r * cols + c] = (n_diagonal * diagonal + straight) * least
+    return ahead
+
+
+@_part
+def _neighbours(cols, pixel):
+    """Return the steps to the 8 neighbours of a pixel, as flat indices and as distances.
+
+    Args:
+        cols: Number of columns of the map.
+        pixel: Height and width of a pixel, m.
+
+    Returns:
+        Steps along the column, along the row, and in all, shape (3, neighbour), and distances.
+    """
+    steps = np.empty((3, 8), np.int64)
+    length = np.empty(8)
+    k = 0
+    for down in range(-1, 2):
+        for right in range(-1, 2):
+            if down == 0 and right == 0:
+                continue
+            steps[0, k] = down * cols
+            steps[1, k] = right
+            steps[2, k] = down * cols + right
+            length[k] = pixel[1] if down == 0 else pixel[0]
+            if down != 0 and right != 0:
+                length[k] = math.hypot(pixel[0], pixel[1])
+            k += 1
+    return steps, length
 
 
 @_part
 def _mark(goals, is_goal):
-    """Mark the goals inside the mask; return their number and the rectangle around them."""
+    """Mark the goals inside the frame; return their number and the rectangle around them."""
     rows, cols = is_goal.shape
     n = 0
     box = rows, 0, cols, 0
     for k in range(len(goals)):
         r = goals[k, 0]
         c = goals[k, 1]
-        if 0 <= r < rows and 0 <= c < cols and not is_goal[r, c]:
+        if _is_inside((r, c), is_goal.shape) and not is_goal[r, c]:
             is_goal[r, c] = True
             n += 1
             box = min(box[0], r), max(box[1], r), min(box[2], c), max(box[3], c)
     return n, box
+
+
+@_part
+def _is_inside(pixel, shape):
+    """Return whether a pixel (row, col) is inside the frame of a map."""
+    return 0 < pixel[0] < shape[0] - 1 and 0 < pixel[1] < shape[1] - 1
+
+
+@_part
+def _rise(keys, queue, place, at, key, pixel):
+    """Move a pixel up from a position of a binary heap, in the order of keys and then of pixels.
+
+    Args:
+        keys: Keys of the pixels in the heap.
+        queue: Flat indices of the pixels in the heap.
+        place: Position of each pixel in the heap; -1 if it is not there.
+        at: Position.
+        key: Key of the pixel.
+        pixel: Flat index of the pixel.
+    """
+    while at > 0:
+        parent = (at - 1) // 2
+        if keys[parent] < key or (keys[parent] == key and queue[parent] < pixel):
+            break
+        keys[at] = keys[parent]
+        queue[at] = queue[parent]
+        place[queue[at]] = at
+        at = parent
+    keys[at] = key
+    queue[at] = pixel
+    place[pixel] = at
+
+
+@_part
+def _pop(keys, queue, place, n):
+    """Remove the first of the n pixels of a binary heap; see `_rise`."""
+    first = queue[0]
+    n -= 1
+    at = 0
+    child = 1
+    while child < n:
+        if child + 1 < n:  # without branches, which are hard to predict
+            equal = (keys[child + 1] == keys[child]) & (queue[child + 1] < queue[child])
+            child += (keys[child + 1] < keys[child]) | equal
+        keys[at] = keys[child]
+        queue[at] = queue[child]
+        place[queue[at]] = at
+        at = child
+        child = 2 * at + 1
+    _rise(keys, queue, place, at, keys[n], queue[n])
+    place[first] = -1
+    return first
 
 
 @_part
@@ -159,7 +249,8 @@ def search(pace, pixel, start, goals, slack):
     consistent.
 
     Args:
-        pace: Inverse of the speed on each pixel (row, col); infinite where impassable.
+        pace: Inverse of the speed on each pixel (row, col); infinite where impassable, and in a
+            frame around the map (see `framed`).
         pixel: Height and width of a pixel, m.
         start: Row and column.
         goals: Rows and columns, shape (goal, 2).
@@ -173,64 +264,67 @@ def search(pace, pixel, start, goals, slack):
     rows, cols = pace.shape
     best = np.full((rows, cols), np.inf)
     came = np.full((rows, cols), -1)
-    least = np.inf
-    for r in range(rows):
-        for c in range(cols):
-            least = min(least, pace[r, c])
-    diagonal = math.hypot(pixel[0], pixel[1])
-
     is_goal = np.zeros((rows, cols), np.bool_)
+    marks = is_goal.reshape(-1)
     n_left, box = _mark(goals, is_goal)
-    if n_left == 0 or not (0 <= start[0] < rows and 0 <= start[1] < cols):
+    if n_left == 0 or not _is_inside(start, pace.shape):
         return best, came
 
-    best[start] = 0.0
+    paces = pace.reshape(-1)
+    costs = best.reshape(-1)
+    previous = came.reshape(-1)
+    ahead = _least_ahead(pace, pixel, box)
+    steps, lengths = _neighbours(cols, pixel)
+
+    keys = np.empty(len(paces))
+    queue = np.empty(len(paces), np.int64)
+    place = np.full(len(paces), -1)
+    n = 1  # of the queue
+    queue[0] = start[0] * cols + start[1]
+    keys[0] = 0.0
+    place[queue[0]] = 0
+    costs[queue[0]] = 0.0
     limit = np.inf
-    queue = [(0.0, start[0] * cols + start[1])]
-    while queue:
-        estimate, flat = heapq.heappop(queue)
+
+    while n > 0:
+        estimate = keys[0]
         if estimate > limit:
             break
-        r = flat // cols
-        c = flat % cols
+        flat = _pop(keys, queue, place, n)
+        n -= 1
 
-        if is_goal[r, c]:
-            is_goal[r, c] = False
+        if marks[flat]:
+            marks[flat] = False
             n_left -= 1
             if n_left == 0:
                 limit = estimate + slack
                 if slack == 0.0:
                     break
 
-        ahead = _away(r, c, box, pixel, diagonal) * least
-        if estimate > best[r, c] + ahead + _TIE:
-            continue  # a stale entry: a faster way to the pixel was found
-        for dr in range(-1, 2):
-            for dc in range(-1, 2):
-                i = r + dr
-                j = c + dc
-                if (dr == 0 and dc == 0) or not (0 <= i < rows and 0 <= j < cols):
-                    continue
-                # A route must not pass between two impassable pixels or cut the corner of one.
-                if not (np.isfinite(pace[i, c]) and np.isfinite(pace[r, j])):
-                    continue
+        for k in range(8):
+            to = flat + steps[2, k]
+            cost = costs[flat] + 0.5 * (paces[flat] + paces[to]) * lengths[k]
+            if not cost < costs[to]:
+                continue
+            # A route must not pass between two impassable pixels or cut the corner of one.
+            if paces[flat + steps[0, k]] == np.inf or paces[flat + steps[1, k]] == np.inf:
+                continue
 
-                length = _step(dr, dc, pixel, diagonal)
-                cost = best[r, c] + 0.5 * (pace[r, c] + pace[i, j]) * length
-
-                if cost < best[i, j]:
-                    best[i, j] = cost
-                    came[i, j] = flat
-                    ahead = _away(i, j, box, pixel, diagonal) * least
-                    heapq.heappush(queue, (cost + ahead, i * cols + j))
+            costs[to] = cost
+            previous[to] = flat
+            at = place[to]
+            if at < 0:
+                at = n
+                n += 1
+            _rise(keys, queue, place, at, cost + ahead[to], to)
     return best, came
 
 
 @_part
 def way_to(best, came, goal):
     """Return the pixels (point, 2) of the way that `search` found to a goal; empty if none."""
-    rows, cols = best.shape
-    if not (0 <= goal[0] < rows and 0 <= goal[1] < cols) or not np.isfinite(best[goal]):
+    _, cols = best.shape
+    if not _is_inside(goal, best.shape) or not np.isfinite(best[goal]):
         return np.empty((0, 2), np.int64)
 
     n = 1
@@ -250,7 +344,10 @@ def way_to(best, came, goal):
 
 @_compiled
 def a_star(pace, pixel, start, goal):
-    """Find the pixels (point, 2) of the fastest way between two pixels; empty if there is none."""
+    """Find the pixels (point, 2) of the fastest way between two pixels; empty if there is none.
+
+    The map of paces has a frame; see `search`.
+    """
     best, came = search(pace, pixel, start, np.array([[goal[0], goal[1]]]), 0.0)
     return way_to(best, came, goal)
 
@@ -276,26 +373,22 @@ def _is_only_one(pace, pixel, best, way):
 
     `best` contains the cost of all pixels from which another way could lead to the end.
     """
-    rows, cols = pace.shape
-    diagonal = math.hypot(pixel[0], pixel[1])
+    _, cols = pace.shape
+    paces = pace.reshape(-1)
+    costs = best.reshape(-1)
+    steps, lengths = _neighbours(cols, pixel)
     for k in range(1, len(way)):
-        r = way[k, 0]
-        c = way[k, 1]
-        for dr in range(-1, 2):
-            for dc in range(-1, 2):
-                i = r + dr
-                j = c + dc
-                if (dr == 0 and dc == 0) or not (0 <= i < rows and 0 <= j < cols):
-                    continue
-                if (i == way[k - 1, 0] and j == way[k - 1, 1]) or not np.isfinite(best[i, j]):
-                    continue
-                if not (np.isfinite(pace[i, c]) and np.isfinite(pace[r, j])):
-                    continue
-
-                length = _step(dr, dc, pixel, diagonal)
-                cost = best[i, j] + 0.5 * (pace[r, c] + pace[i, j]) * length
-                if cost <= best[r, c] + _TIE:
-                    return False
+        flat = way[k, 0] * cols + way[k, 1]
+        before = way[k - 1, 0] * cols + way[k - 1, 1]
+        for m in range(8):
+            other = flat + steps[2, m]
+            if other == before or not np.isfinite(costs[other]):
+                continue
+            if paces[flat + steps[0, m]] == np.inf or paces[flat + steps[1, m]] == np.inf:
+                continue
+            cost = costs[other] + 0.5 * (paces[flat] + paces[other]) * lengths[m]
+            if cost <= costs[flat] + _TIE:
+                return False
     return True
 
 
