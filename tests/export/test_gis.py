@@ -29,6 +29,69 @@ def test_bands_of_a_geotiff_are_the_maps_in_their_place(result, maps, tmp_path):
             assert raster.index(*result.workspace.grid.center(cell)) == cell
 
 
+CHANGED = {
+    "coarsened": lambda maps: maps.coarsen(x=2).mean(),
+    "thinned": lambda maps: maps.isel(x=slice(None, None, 2)),
+    "picked": lambda maps: maps.isel(y=[0, 2], x=[1, 3]),
+    "cut": lambda maps: maps.isel(y=slice(1, 3), x=slice(2, 4)),
+    "reversed": lambda maps: maps.isel(y=slice(None, None, -1), x=slice(None, None, -1)),
+    "shuffled": lambda maps: maps.isel(x=[2, 0, 3, 1]),
+    "transposed": lambda maps: maps.transpose("x", "y"),
+    "one row": lambda maps: maps.isel(y=[1]),
+    "one column": lambda maps: maps.isel(x=[2], y=slice(0, 2)),
+    "one cell": lambda maps: maps.isel(x=[2], y=[1]),
+    "moved": lambda maps: maps.assign_coords(x=maps["x"] + 1000.0),
+}
+
+
+@pytest.mark.parametrize("change", CHANGED.values(), ids=CHANGED)
+def test_a_geotiff_has_each_value_at_its_own_coordinates(change, maps, tmp_path):
+    changed = change(maps)
+    write_geotiff(tmp_path / "maps.tif", changed)
+    with rasterio.open(tmp_path / "maps.tif") as raster:
+        assert raster.transform.a > 0.0 > raster.transform.e
+        assert raster.shape == (changed.sizes["y"], changed.sizes["x"])
+        for x in changed["x"].values:
+            for y in changed["y"].values:
+                expected = changed["trust_mean"].sel(x=x, y=y).item()
+                np.testing.assert_allclose(*next(raster.sample([(x, y)], 1)), expected, rtol=1e-6)
+                np.testing.assert_allclose(raster.xy(*raster.index(x, y)), (x, y), atol=1e-6)
+
+
+REFUSED = {
+    "uneven": lambda maps: maps.isel(x=[0, 1, 3]),
+    "repeated": lambda maps: maps.isel(y=[1, 1]),
+    "without coordinates": lambda maps: maps.drop_vars("y"),
+    "of rows": lambda maps: maps.rename(y="row", x="col"),
+    "of texts": lambda maps: maps.assign_coords(x=list("abcd")),
+    "with a missing coordinate": lambda maps: maps.assign_coords(y=[np.nan, 1.0, 0.0]),
+    "empty": lambda maps: maps.isel(x=slice(0, 0)),
+    "averaged to a column": lambda maps: maps.coarsen(x=4, y=2, boundary="trim").mean(),
+    "of one row": lambda maps: maps.isel(y=0),
+    "with a text": lambda maps: maps.assign(note="tuesday"),
+    "of names": lambda maps: maps.assign(kind=maps["cost"].astype(str)),
+    "of no variables": lambda maps: maps[[]],
+}
+
+
+@pytest.mark.parametrize("change", REFUSED.values(), ids=REFUSED)
+def test_maps_without_a_place_of_their_own_are_refused(change, maps, tmp_path):
+    with pytest.raises(TrustboError):
+        write_geotiff(tmp_path / "maps.tif", change(maps))
+    assert not list(tmp_path.iterdir())
+
+
+def test_maps_of_robots_are_bands_named_by_quantity_and_robot(result, maps, tmp_path):
+    robots = result.robot_maps()
+    write_geotiff(tmp_path / "robots.tif", robots.assign(cost=maps["cost"]))
+    with rasterio.open(tmp_path / "robots.tif") as raster:
+        assert raster.descriptions[:2] == ("trust_mean r1", "trust_mean r2")
+        for i, band in enumerate(raster.descriptions, start=1):
+            name, *robot = band.split()
+            expected = robots[name].sel(robot=robot[0]) if robot else maps[name]
+            np.testing.assert_allclose(raster.read(i), expected, rtol=1e-6)
+
+
 @pytest.mark.parametrize("format_", [name for name, (file, _) in WRITERS.items() if "." in file])
 def test_a_full_disk_leaves_the_file_as_it_was(format_, result, tmp_path):
     [file] = export_result(result, tmp_path, [format_])

@@ -14,10 +14,11 @@ from shapely import affinity
 from trustbo.campaign.result import Result
 from trustbo.data import POST_SETS
 from trustbo.errors import TrustboError, require_kind
+from trustbo.export.bands import bands_of, north_up
 from trustbo.files import FilePath, to_path, write_file, write_text
 from trustbo.logs.table import to_frame
 from trustbo.planning import Plan
-from trustbo.terrain.place import converted, quiet_affine
+from trustbo.terrain.place import converted
 from trustbo.workspace.moves import cells_along, posts_along
 
 _NO_CRS = "this export needs a CRS; make the workspace with Workspace.from_terrain."
@@ -28,17 +29,21 @@ _TIFF = (".tif", ".tiff")
 def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
     """Write maps of the planning cells as the bands of a GeoTIFF in the terrain's CRS.
 
-    Bands are float32 with nodata NaN, and their descriptions are the variable names. Files in which
-    a GIS stored statistics, overviews or masks of an older raster of that name are removed.
+    Bands are float32 with nodata NaN, and their descriptions are the variable names. Maps of
+    several robots have a band for each, such as "trust_mean r1". North is at the top, and the
+    pixels are where the coordinates `x` and `y` of the maps are, also after xarray has selected or
+    averaged cells. Files in which a GIS stored statistics, overviews or masks of an older raster of
+    that name are removed.
 
     Args:
         path: .tif or .tiff file to write or replace.
-        maps: Result or campaign, or maps such as `Result.maps()`. Before the first mission, the
-            maps are those of the prior.
+        maps: Result or campaign, or maps such as `Result.maps()` or `Result.robot_maps()`. Before
+            the first mission, the maps are those of the prior.
 
     Raises:
-        TrustboError: `maps` is a plan, which has no maps of all cells; `maps` has no CRS; or the
-            file cannot be written.
+        TrustboError: `maps` is a plan, which has no maps of all cells; `maps` has no CRS, or no
+            coordinates at equal distances; a variable is not a map of numbers; or the file cannot
+            be written.
 
     Example:
         >>> tb.export.write_geotiff("maps.tif", result.maps())
@@ -50,23 +55,23 @@ def write_geotiff(path: FilePath, maps: Result | xr.Dataset) -> None:
         raise TrustboError(f"{str(target)!r} must end in {' or '.join(_TIFF)}.")
 
     if maps.rio.crs is None:
-        raise TrustboError(_NO_CRS)
-    with quiet_affine():
-        place = maps.rio.transform()
+        raise TrustboError(f"{_NO_CRS[:-1]}, or open a file of maps with decode_coords='all'.")
+    placed, transform = north_up(maps)
+    bands = bands_of(placed)
 
     profile = {
-        "driver": "GTiff", "interleave": "band", "height": maps.sizes["y"],
-        "width": maps.sizes["x"], "count": len(maps.data_vars), "dtype": "float32",
-        "nodata": np.nan, "crs": maps.rio.crs, "transform": place,
+        "driver": "GTiff", "interleave": "band", "height": placed.sizes["y"],
+        "width": placed.sizes["x"], "count": len(bands), "dtype": "float32",
+        "nodata": np.nan, "crs": maps.rio.crs, "transform": transform,
         "compress": "deflate",
     }  # fmt: skip
 
     # In memory, because rasterio raises no error if it closes a file on a full disk.
     with MemoryFile() as memory:
         with memory.open(**profile) as raster:
-            for i, (name, values) in enumerate(maps.data_vars.items(), start=1):
-                raster.write(values.transpose("y", "x").values.astype(np.float32), i)
-                raster.set_band_description(i, str(name))
+            for i, (name, values) in enumerate(bands, start=1):
+                raster.write(values.values.astype(np.float32), i)
+                raster.set_band_description(i, name)
                 if "long_name" in values.attrs:
                     raster.update_tags(i, long_name=str(values.attrs["long_name"]))
         content = memory.read()
