@@ -145,6 +145,17 @@ def require_position(what: str, value: Any) -> tuple[float, float]:
     return require_finite(f"x of {what}", x), require_finite(f"y of {what}", y)
 
 
+def require_switch(what: str, value: Any) -> bool:
+    """Return `value` as a bool; raises TrustboError unless it is True or False.
+
+    Texts such as "False", from a form or an environment variable, would count as true.
+    """
+    kind = getattr(getattr(value, "dtype", None), "kind", "")
+    if isinstance(value, bool) or (kind == "b" and value.ndim == 0):  # also of NumPy and JAX
+        return bool(value)
+    raise TrustboError(f"{what} must be True or False; got {one_line(value)}.")
+
+
 def require_kind(what: str, value: Any, kind: Any, remedy: str) -> Any:
     """Return `value` if it is an instance of `kind`; otherwise raise a TrustboError."""
     if not isinstance(value, kind):

@@ -37,6 +37,7 @@ from trustbo.errors import (
     require_list,
     require_order,
     require_pair,
+    require_switch,
     require_whole,
     warn,
 )
@@ -146,6 +147,8 @@ class Campaign(Recorder):
                 mission to learn from, or if the model cannot be fitted to its missions.
             NoPathError: The goal cannot be reached.
         """
+        require_switch("overwrite", overwrite)
+        require_switch("progress", progress)
         require_kind("workspace", workspace, Workspace, "give a trustbo.Workspace")
         require_choice("initial", initial, ("prior_mean", "prior_draw"))
         require_choice("awareness", awareness, AWARENESS)
@@ -368,6 +371,7 @@ class Campaign(Recorder):
             UserWarning: The mission began or ended elsewhere than planned; it is recorded but
                 excluded or not learned yet; or what was learned could not be written.
         """
+        require_switch("again", again)
         require_kind("mission", mission, Mission, "give one trustbo.Mission at a time")
         with self._turn:
             self.storage.require_open()
@@ -580,6 +584,7 @@ class Campaign(Recorder):
         Raises:
             TrustboError: The input is invalid; raised before any work starts.
         """
+        require_switch("progress", progress)
         require_whole("n_iterations", n_iterations, 1)
         runner = require_simulator(self, simulator)
         require_stop(stop)
@@ -658,6 +663,7 @@ class Campaign(Recorder):
             TrustboError: The folder contains no campaign or is locked by another process, a custom
                 model or policy is not given, or a file is missing or damaged.
         """
+        require_switch("progress", progress)
         lock = lock_campaign(directory)
         try:
             state, workspace, files = read_campaign(lock.path)

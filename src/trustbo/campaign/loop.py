@@ -7,7 +7,7 @@ from typing import Any
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.stopping import Stop
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_switch
 from trustbo.files import FilePath
 from trustbo.inference.learner import Model
 from trustbo.planning.policies import Policy
@@ -66,6 +66,8 @@ def iterate(
         >>> courses = [((9, 0), (0, 9)), ((0, 0), (9, 9))]
         >>> tb.iterate(workspace, courses=courses, n_iterations=2).table()[["start", "goal"]]
     """
+    require_switch("overwrite", overwrite)
+    require_switch("progress", progress)
     _require_arguments(options)
     if (start is None and goal is None) == (courses is None):
         raise TrustboError("give start and goal, or courses=[(start, goal), ...], and not both.")
@@ -122,6 +124,7 @@ def resume(
         >>> len(campaign.missions)
         2
     """
+    require_switch("progress", progress)
     with Campaign.load(directory, model=model, policy=policy, progress=progress) as campaign:
         state = campaign.state
         before = state.simulation

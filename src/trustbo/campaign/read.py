@@ -21,7 +21,7 @@ from trustbo.campaign.record import (
 from trustbo.campaign.replace import has_campaign, is_being_replaced, recover
 from trustbo.campaign.result import Result
 from trustbo.campaign.state import Entry, State
-from trustbo.errors import TrustboError, warn
+from trustbo.errors import TrustboError, require_switch, warn
 from trustbo.files import FilePath, to_path
 from trustbo.inference.functions.known import is_of_function
 from trustbo.inference.learner import Learner, Model, learner_from_record
@@ -143,6 +143,7 @@ def load_result(
         >>> result = tb.load_result("hills")
         >>> result.table()
     """
+    require_switch("progress", progress)
     state, workspace, _ = read_campaign(directory)
     if not state.entries and not state.earlier.missions:
         raise TrustboError(f"the campaign in {str(directory)!r} has no mission; run one first.")

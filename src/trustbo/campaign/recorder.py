@@ -10,7 +10,7 @@ from trustbo.campaign.folder import FolderStorage, MemoryStorage
 from trustbo.campaign.learning import with_posterior
 from trustbo.campaign.result import Result
 from trustbo.campaign.state import Entry, Exclusion, State
-from trustbo.errors import TrustboError, require_whole, warn
+from trustbo.errors import TrustboError, require_switch, require_whole, warn
 from trustbo.files import FilePath, holding_interrupts
 from trustbo.inference.learner import Learner
 from trustbo.workspace import Workspace
@@ -40,6 +40,7 @@ class Recorder(Result):
         Raises:
             TrustboError: The folder already contains a campaign or cannot be written.
         """
+        require_switch("overwrite", overwrite)
         with self._turn:
             # Other threads may be waiting for the campaign's lock, which therefore stays the same.
             storage = FolderStorage.begin(

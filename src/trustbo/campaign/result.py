@@ -20,7 +20,7 @@ from trustbo.campaign.settings import to_planner
 from trustbo.campaign.state import EARLIER, State
 from trustbo.data import NOWHERE, POST_SETS, Cell, Mission, path_text
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_kind
+from trustbo.errors import TrustboError, require_kind, require_switch
 from trustbo.files import FilePath
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference.learner import Learner
@@ -457,6 +457,8 @@ class Result(Summary):
             >>> trust = result.trust("r2", (3, 4))
             >>> float(trust.mean()), float(trust.std())
         """
+        require_switch("as_rate", as_rate)
+        require_switch("expected", expected)
         draws = self._ahead.of_robots(expected=expected)
         about = {"move": move, "posts": posts, "as_rate": as_rate}
         return robot_trust(self.workspace, self._rates, draws, robot, cell, **about)
@@ -551,6 +553,7 @@ class Result(Summary):
             Dataset with the dims (robot, y, x) of the mean `trust_mean` and standard deviation
             `trust_sd` of trust, and the mean `contact_rate`; see `planning.Planner.robot_maps`.
         """
+        require_switch("expected", expected)
         return robot_maps(self.workspace, self._rates, self._ahead.of_robots(expected=expected))
 
     @property
@@ -669,6 +672,7 @@ class Result(Summary):
             Dataset with the dims (y, x), whose coordinates are the centres of the cells in CRS
             metres; `isel(y=row, x=col)` selects a cell, and the accessor `.rio` writes rasters.
         """
+        require_switch("expected", expected)
         if self.state.last is None:
             # The largest trust of many paths would be far too high with unknown effects of places.
             prior = self.draw_prior(n_draws)
@@ -740,6 +744,7 @@ class Result(Summary):
                 campaign uses it, other files have the names of a campaign's files, or the folder
                 cannot be written.
         """
+        require_switch("overwrite", overwrite)
         with self._turn:
             state = without_lost_posteriors(self.state)
             FolderStorage.begin(directory, self.workspace, state, overwrite=overwrite).close()

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from trustbo.errors import TrustboError, require_kind
+from trustbo.errors import TrustboError, require_kind, require_switch
 from trustbo.files import to_json, to_plain
 from trustbo.hazard import Hazard
 from trustbo.inference.fit import fit, require_numbers_of_draws
@@ -45,7 +45,7 @@ def require_options_of_fit(options: Any) -> dict[str, Any]:
 
     Raises:
         TrustboError: The options are not a dict, one of them is given to or set by the campaign, or
-            a number of draws is not a whole number.
+            a number of draws is not a whole number or `check` is not True or False.
         TypeError: `fit` has no such option.
     """
     given = _require_options("fit", options, _OF_FIT, _SET_IN_FIT)
@@ -54,6 +54,7 @@ def require_options_of_fit(options: Any) -> dict[str, Any]:
 
     whole = bound.arguments
     require_numbers_of_draws(whole["draws"], whole["chains"], whole["warmup"])
+    require_switch("check", whole["check"])
     return given
 
 

@@ -9,7 +9,7 @@ import xarray as xr
 from arviz_stats.loo.compare import compare as ranked
 from arviz_stats.utils import ELPDData
 
-from trustbo.errors import TrustboError, one_line
+from trustbo.errors import TrustboError, one_line, require_switch
 from trustbo.inference.learner import Model
 from trustbo.inference.loo import complete, estimated
 from trustbo.inference.tree import LIKELIHOOD_OF, RATES
@@ -77,6 +77,7 @@ def compare(
         >>> hierarchical = tb.fit(missions, tb.models.HierarchicalTrust())
         >>> tb.compare({"pooled": pooled, "hierarchical": hierarchical})[["rank", "elpd_diff"]]
     """
+    require_switch("progress", progress)
     if not isinstance(posteriors, Mapping) or len(posteriors) < 2:
         raise TrustboError(
             f"compare needs a dict of two or more posteriors by name; got {one_line(posteriors)}."

@@ -13,6 +13,7 @@ from trustbo.errors import (
     TrustboError,
     require_choice,
     require_count,
+    require_switch,
     require_whole,
 )
 from trustbo.inference.learner import as_learner
@@ -114,6 +115,9 @@ def fit(
         >>> posterior = tb.fit(missions, tb.models.PooledTrust())
         >>> az.summary(posterior)
     """
+    require_switch("progress", progress)
+    require_switch("check", check)
+    require_switch("latent", latent)
     started = time.perf_counter()
     earlier = list_of_missions(earlier, "earlier")
     missions, robots = prepare(missions, workspace, earlier)

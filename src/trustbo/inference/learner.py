@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import xarray as xr
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_kind, see
+from trustbo.errors import TrustboError, require_kind, require_switch, see
 from trustbo.inference.classes import (
     SAMPLERS,
     OfClass,
@@ -334,6 +334,7 @@ def params_of(
         >>> params = tb.inference.params_of(posterior, workspace)  # leading axis (draw,)
         >>> tb.Planner(workspace, (9, 0), (0, 9)).plan(params.mean()).path
     """
+    require_switch("next_mission", next_mission)
     posterior = as_fitted("params_of", posterior)
     learner = learner_of_posterior(posterior, model)
     return learner.draws(posterior, workspace, next_mission=next_mission)
@@ -378,6 +379,7 @@ def add_latent(
         >>> tb.inference.add_latent(posterior)["latent"]["trust_mean"].dims
         ('mission', 'bound', 'robot')
     """
+    require_switch("progress", progress)
     posterior = as_fitted("add_latent", posterior)
     if "latent" in posterior.children:
         return posterior

@@ -29,7 +29,7 @@ from tqdm import tqdm
 from trustbo.arrays import evenly_spaced, in_order
 from trustbo.data import Mission
 from trustbo.display import slow_bar
-from trustbo.errors import PosteriorError, TrustboError, warn
+from trustbo.errors import PosteriorError, TrustboError, require_switch, warn
 from trustbo.inference.density import at
 from trustbo.inference.fit import fit
 from trustbo.inference.functions.fit import log_likelihood_of_function
@@ -95,6 +95,7 @@ def loo(
         >>> elpd = tb.inference.loo(posterior)
         >>> elpd.elpd, elpd.se
     """
+    require_switch("progress", progress)
     return estimated(complete("loo", posterior, model), model, progress=progress)
 
 

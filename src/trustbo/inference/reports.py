@@ -9,7 +9,13 @@ from scipy.special import softmax
 
 from trustbo.arrays import evenly_spaced
 from trustbo.data import Mission, levels_of
-from trustbo.errors import TrustboError, require_choice, require_count, require_whole
+from trustbo.errors import (
+    TrustboError,
+    require_choice,
+    require_count,
+    require_switch,
+    require_whole,
+)
 from trustbo.inference.classes import OfClass
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.params import QUANTILES, as_fitted, is_of_people, read_posterior
@@ -73,6 +79,7 @@ def predict_reports(
         >>> posterior = tb.fit(people)
         >>> tb.inference.predict_reports(posterior, people, fitted=True).attrs["mae"]
     """
+    require_switch("fitted", fitted)
     posterior = as_fitted("predict_reports", posterior)
     if not is_of_people(posterior):
         raise TrustboError(

@@ -1,5 +1,6 @@
 """The default model of `fit`, campaigns, studies and the command line."""
 
+from trustbo.errors import require_switch
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.pooled import PooledTrust
@@ -21,5 +22,6 @@ def default_model(*, places: bool = True, priors: Priors | None = None) -> Poole
         ...     workspace, (9, 0), (0, 9), model=tb.models.default_model(priors=priors)
         ... )
     """
+    require_switch("places", places)
     effects = (PlaceEffect(), RobotEffect()) if places else (RobotEffect(),)
     return PooledTrust(effects=effects) if priors is None else PooledTrust(priors, effects=effects)

@@ -10,7 +10,7 @@ import numpy as np
 from trustbo.arrays import Names
 from trustbo.data import sight_columns
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_switch
 from trustbo.models.robots_in_bounds import RobotsInBounds
 from trustbo.models.sight_scale import scale_at, variation
 from trustbo.statespace import Inputs, StateSpace
@@ -275,6 +275,7 @@ class Draws(Summary):
             n_robots: Number of robots.
             adds_noise: Whether the observation family adds noise (see `coupled_robots`).
         """
+        require_switch("adds_noise", adds_noise)
         form: dict[str, Any] = {n: v for n, v in self.arrays.items() if n not in _OF_INPUTS}
         if "transition" in form:
             return StateSpace(**form)

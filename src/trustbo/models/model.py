@@ -14,7 +14,7 @@ from scipy import sparse
 
 from trustbo.data import Mission
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_choice, require_list
+from trustbo.errors import TrustboError, require_choice, require_list, require_switch
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Effect, Theta, sample_coefficients
 from trustbo.models.effects.weights import Weights
@@ -152,6 +152,7 @@ class TrustModel(Summary, ABC):
 
     def layout(self, observations: Observations, *, contrasts: bool = True) -> Layout:
         """Arrange rates in blocks; if `contrasts` is false, each row is the rate of one robot."""
+        require_switch("contrasts", contrasts)
         return Layout.from_rates(
             observations.contact_rate,
             joint=self.joint,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpyro.distributions import Distribution
 
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import require_choice, require_switch
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import Weights
 from trustbo.models.model import TrustModel
@@ -46,9 +46,8 @@ class PooledTrust(TrustModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("memory", self.memory, ("level", "deviation"))
-        if self.shared_noise not in (0, 1):
-            raise TrustboError(f"shared_noise must be True or False; got {self.shared_noise!r}.")
-        object.__setattr__(self, "shared_noise", bool(self.shared_noise))
+        shared_noise = require_switch("shared_noise", self.shared_noise)
+        object.__setattr__(self, "shared_noise", shared_noise)
 
     @property
     def weights(self) -> Weights:

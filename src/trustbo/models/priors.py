@@ -20,6 +20,7 @@ from trustbo.errors import (
     require_list,
     require_order,
     require_positive,
+    require_switch,
     see,
 )
 from trustbo.models.backend import own_flags, own_settings
@@ -110,6 +111,7 @@ class Priors(Summary):
         return list(self.describe().items())
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "stationary", require_switch("stationary", self.stationary))
         given = (one.name for one in fields(self) if one.type is Distribution)
         for name in (*given, *(["f_v"] if self.f_v is not None else [])):
             prior = getattr(self, name)

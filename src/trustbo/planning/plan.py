@@ -20,6 +20,7 @@ from trustbo.data import (
     stations_of,
 )
 from trustbo.display import Rows, Summary, joined
+from trustbo.errors import require_switch
 from trustbo.hazard.path_risk import PathRisk
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import cells_along, posts_along
@@ -116,6 +117,8 @@ class Plan(Summary):
     post_sets: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        require_switch("exact", self.exact)
+        require_switch("infeasible", self.infeasible)
         path, post_sets = split_path(self.path, self.post_sets)
         object.__setattr__(self, "path", path)
         object.__setattr__(self, "post_sets", post_sets)

@@ -19,6 +19,7 @@ from trustbo.errors import (
     require_bounds,
     require_choice,
     require_positive,
+    require_switch,
     require_whole,
     warn,
 )
@@ -553,6 +554,8 @@ class Planner(Summary):
         Example:
             >>> planner.trust(posterior, "r2", (3, 4)).quantile([0.05, 0.5, 0.95])
         """
+        require_switch("as_rate", as_rate)
+        require_switch("expected", expected)
         self.problem.require_family(params, uses_rates=as_rate)
         draws = draws_of(params, self.workspace).of_robots(expected=expected)
         family = self.problem.likelihood
@@ -575,6 +578,7 @@ class Planner(Summary):
             variables are the mean `trust_mean` and standard deviation `trust_sd` of `trust`, and
             the mean `contact_rate` of `trust(as_rate=True)`. Cells that no bound enters are NaN.
         """
+        require_switch("expected", expected)
         self.problem.require_family(posterior, uses_rates=True)
         draws = draws_of(posterior, self.workspace).of_robots(expected=expected)
         return robot_maps(self.workspace, self.problem.likelihood, draws)
@@ -604,6 +608,8 @@ class Planner(Summary):
             expected: Whether to use the expected effects of robots in the next mission, instead of
                 drawing them; see `trust`.
         """
+        require_switch("per_robot", per_robot)
+        require_switch("expected", expected)
         draws = draws_of(params, self.workspace).of_robots(expected=expected)
         trust = trust_map(self.problem, draws, per_robot=per_robot, x0=x0)
         return trust if draws.n_draws > 1 else trust.isel(draw=0)
@@ -618,6 +624,8 @@ class Planner(Summary):
         expected: bool = False,
     ) -> xr.DataArray:
         """Compute the cost f = 1 - sigma(trust) of each cell, equation (6), from `trust_map`."""
+        require_switch("per_robot", per_robot)
+        require_switch("expected", expected)
         return cost_of(self.trust_map(params, per_robot=per_robot, x0=x0, expected=expected))
 
     @computing()
@@ -648,6 +656,7 @@ class Planner(Summary):
             effects, there are also their `place_mean` and `place_sd`. Impassable cells are NaN. The
             attribute `start` of the maps of trust and cost is the start, where trust is assumed.
         """
+        require_switch("expected", expected)
         ahead = draws_of(posterior, self.workspace)
         return maps_of(
             self._informed_by(posterior).problem, ahead, n_draws, seed, expected=expected

@@ -8,7 +8,14 @@ import numpy as np
 import xarray as xr
 
 from trustbo.data import Cell, Mission, Station
-from trustbo.errors import TrustboError, require_kind, require_list, require_positive, require_whole
+from trustbo.errors import (
+    TrustboError,
+    require_kind,
+    require_list,
+    require_positive,
+    require_switch,
+    require_whole,
+)
 from trustbo.simulation.events import Event
 from trustbo.simulation.motion import drive_together
 from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
@@ -139,6 +146,7 @@ class KinematicSimulator(DescribedSimulator):
 
     def world(self, mission: int = 0, *, long_run: bool = False) -> World:
         """Return the world of a mission; if `long_run`, random factors are replaced by means."""
+        require_switch("long_run", long_run)
         number = require_whole("mission", mission, 0)
         world = self._usual._replace(mission=None if long_run else number)
         for event in self.events:
@@ -249,6 +257,7 @@ class KinematicSimulator(DescribedSimulator):
             For each continuation, the movements, the contact at each tick, shape (tick, robot), and
             the state after the bound.
         """
+        require_switch("expected", expected)
         cell = ahead[0][0]
         # First phase: the lead drives, and T2 watches.
         goals = self._posts.stop(cell)[None]

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 
 from trustbo.data import Cell, Mission, path_text, require_map, split_path, stations_of
-from trustbo.errors import TrustboError, require_whole
+from trustbo.errors import TrustboError, require_switch, require_whole
 from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.stacking import list_of_missions
 
@@ -32,6 +32,7 @@ class ReplaySimulator(DescribedSimulator):
         Raises:
             TrustboError: There are no missions, or they have no map.
         """
+        require_switch("any_path", any_path)
         missions = list_of_missions(missions)
         if not missions:
             raise TrustboError("missions must contain at least one mission; got none.")

@@ -15,7 +15,7 @@ import xarray as xr
 
 from trustbo.data import POST_SETS, Cell, Station, cells_of, stations_of
 from trustbo.display import Rows, Summary, announced
-from trustbo.errors import TrustboError, require_count, require_whole
+from trustbo.errors import TrustboError, require_count, require_switch, require_whole
 from trustbo.files import FilePath, to_json, to_path, write_file
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.paths import AdmissiblePaths, NoPathError
@@ -182,6 +182,7 @@ class Truth(Summary):
             TrustboError: A cell is off the grid or impassable, or `max_bounds` is too small.
             NoPathError: The goal cannot be reached, or the contact of all paths is unknown.
         """
+        require_switch("failures", failures)
         paths = AdmissiblePaths(self.workspace, start, goal, max_bounds)
         contact = self.bounds["contact"].values
         passed = self.bounds["passed"].values if failures else np.ones(contact.shape)

@@ -33,6 +33,7 @@ from trustbo.errors import (
     require_kind,
     require_list,
     require_positive,
+    require_switch,
     require_whole,
 )
 from trustbo.team import Team
@@ -164,6 +165,7 @@ class Workspace(Summary):
         Example:
             >>> tb.Workspace.from_terrain(terrain, shape=(10, 10), team=tb.Team(n_robots=3))
         """
+        require_switch("bounds", bounds)
         terrain = require_terrain(terrain)
         team = Team.of(team)
         sight = Sight.of(sight)
@@ -467,6 +469,7 @@ class Workspace(Summary):
             TrustboError: A cell is off the grid, impassable, or not a neighbour of the previous
                 one.
         """
+        require_switch("anywhere", anywhere)
         locate = self.grid.locate if anywhere else self.locate
         path = require_list("path", path, remedy="give cells (row, col)")
         if not path:

@@ -16,7 +16,7 @@ from numpy.random import Generator
 from numpyro.distributions import Distribution
 
 from trustbo.data import Mission
-from trustbo.errors import TrustboError, require_positive
+from trustbo.errors import TrustboError, require_positive, require_switch
 from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
 from trustbo.statespace.matrices import namespace
@@ -142,6 +142,7 @@ class Effect:
 
     def for_features(self, features: Sequence[str], *, of_rates: bool) -> Self:
         """Return the effect for these features; `of_rates` is false if trust is a logit."""
+        require_switch("of_rates", of_rates)
         return self
 
     def pairs(self, observations: Observations) -> list[Pair]:

@@ -12,7 +12,7 @@ from scipy import sparse
 from scipy.linalg import helmert, lapack
 
 from trustbo.data import Mission, sight_columns
-from trustbo.errors import require_positive, require_share
+from trustbo.errors import require_positive, require_share, require_switch
 from trustbo.models.effects.effect import LEAST, Effect, Theta, Values
 from trustbo.models.observations import Observations
 from trustbo.models.scores import Pair
@@ -109,6 +109,7 @@ class PlaceEffect(Effect):
 
     def for_features(self, features: Sequence[str], *, of_rates: bool) -> Self:
         """See `Effect.for_features`; the floor is 1 if trust is a logit."""
+        require_switch("of_rates", of_rates)
         return self if of_rates else replace(self, f_e=1.0)
 
     def hyperpriors(self) -> dict[str, dist.Distribution]:
