@@ -22,6 +22,7 @@ from trustbo.errors import (
     require_positive,
     require_whole,
 )
+from trustbo.fixed import Fixed, fixed_array
 
 Cell = tuple[int, int]
 Station = tuple[Any, ...]
@@ -125,7 +126,7 @@ class Bound:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Mission(Summary):
+class Mission(Fixed, Summary):
     """One traversal of a path: the measurements of the bounds that were run, and the outcome.
 
     `from_arrays` makes a mission of the arrays of a log, which may carry labels. The arrays of a
@@ -742,11 +743,7 @@ def _require_recorded(where: str, n_robots: int, poses: Any, contact: Any) -> No
 
 def _own(values: Any, dtype: type) -> Any:
     """Return a read-only copy; None, and an array that is such a copy, as they are."""
-    if values is None or (values.flags.owndata and not values.flags.writeable):
-        return values
-    copied = np.array(values, dtype)
-    copied.flags.writeable = False
-    return copied
+    return None if values is None else fixed_array(np.asarray(values, dtype))
 
 
 def _per_robot(what: str, given: Any, robots: Sequence[str], shape: tuple[int, ...]) -> np.ndarray:

@@ -562,7 +562,7 @@ class Result(Summary):
 
         It begins at the start of the course of `plan()`.
         """
-        return self._trust_map_of(self._shown())
+        return self._trust_map_of(self._shown()).copy()
 
     def _trust_map_of(self, course: Course) -> xr.DataArray:
         """Return the trust map of a course, from its start."""

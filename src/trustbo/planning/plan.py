@@ -21,6 +21,7 @@ from trustbo.data import (
 )
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import require_switch
+from trustbo.fixed import Fixed, mark
 from trustbo.hazard.path_risk import PathRisk
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import cells_along, posts_along
@@ -53,7 +54,7 @@ class PastFailure(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Plan(Summary):
+class Plan(Fixed, Summary):
     """A path, its expected trust and value, and whether it is provably optimal.
 
     The properties `stops`, `posts` and `routes` are computed on demand, in CRS metres. If the
@@ -122,6 +123,7 @@ class Plan(Summary):
         path, post_sets = split_path(self.path, self.post_sets)
         object.__setattr__(self, "path", path)
         object.__setattr__(self, "post_sets", post_sets)
+        self._fix()
 
     def with_draws(self, given: Self) -> Self:
         """Return this plan with the bands of `given`, a plan for the same path and many draws."""
@@ -222,7 +224,7 @@ class Plan(Summary):
         """CRS coordinates x and y of the cell centres, shape (cell, 2), in metres."""
         grid = self.workspace.grid
         rows, cols = cells_along(self.path).T
-        return np.stack([grid.x[cols], grid.y[rows]], axis=1)
+        return mark(np.stack([grid.x[cols], grid.y[rows]], axis=1))
 
     @property
     def length(self) -> float:
@@ -255,7 +257,7 @@ class Plan(Summary):
         posts = self.workspace.posts
         if posts is None:
             return None
-        return np.stack([posts.stop(cell) for cell in self.path])
+        return mark(np.stack([posts.stop(cell) for cell in self.path]))
 
     @cached_property
     def posts(self) -> np.ndarray | None:
@@ -263,7 +265,7 @@ class Plan(Summary):
         posts = self.workspace.posts
         if posts is None:
             return None
-        return np.stack([posts.watching(*bound) for bound in pairwise(self.stations)])
+        return mark(np.stack([posts.watching(*bound) for bound in pairwise(self.stations)]))
 
     @cached_property
     def routes(self) -> tuple[tuple[np.ndarray | None, ...], ...] | None:

@@ -17,6 +17,7 @@ from trustbo.data import POST_SETS, Cell, Station, cells_of, stations_of
 from trustbo.display import Rows, Summary, announced
 from trustbo.errors import TrustboError, require_count, require_switch, require_whole
 from trustbo.files import FilePath, to_json, to_path, write_file
+from trustbo.fixed import fix
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.paths import AdmissiblePaths, NoPathError
 from trustbo.simulation.model import ModelSimulator
@@ -50,7 +51,7 @@ class Truth(Summary):
     ) -> None:
         """Store the bounds; `of(mission)` computes the truth of another mission's world."""
         self.workspace = workspace
-        self.bounds = bounds
+        self.bounds = fix(bounds)
         self._of = of
 
     def _rows(self) -> Rows:

@@ -36,6 +36,7 @@ from trustbo.errors import (
     require_switch,
     require_whole,
 )
+from trustbo.fixed import Fixed, fix
 from trustbo.team import Team
 from trustbo.terrain.composite import CompositeIndex
 from trustbo.terrain.features import PAPER_VISIBILITY, TRAVERSABILITY, VISIBILITY
@@ -67,7 +68,7 @@ _MIDDLE = (0.1, 0.9)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Workspace(Summary):
+class Workspace(Fixed, Summary):
     """Planning grid with the situational awareness of each robot in each bound.
 
     Attributes:
@@ -105,6 +106,9 @@ class Workspace(Summary):
     onward: xr.DataArray | None = None
     within: "Workspace | None" = None
     places: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._fix()
 
     @classmethod
     def from_terrain(
@@ -444,7 +448,7 @@ class Workspace(Summary):
         if self.posts is not None:
             exists = self.posts.linked_bounds(exists)
         like = self.passable.expand_dims(move=list(MOVE_NAMES), axis=0)
-        return like.copy(data=exists).rename("passable_bounds")
+        return fix(like.copy(data=exists).rename("passable_bounds"))
 
     @cached_property
     def difficulty(self) -> Difficulty:
