@@ -1,7 +1,9 @@
 """Grids of campaigns: what a row says, processes, and going on after a failure or a kill."""
 
 import dataclasses
+import importlib
 import os
+import sys
 import threading
 import types
 from functools import partial
@@ -333,3 +335,66 @@ def test_dask_gives_the_same_table(table, tmp_path, monkeypatch):
     ):
         found = run_grid(CASES, SCENES, tmp_path, seeds=(0, 1), n_missions=2)
     pd.testing.assert_frame_equal(found, table.assign(seconds=found["seconds"]))
+
+
+MODULE = """
+import numpy as np
+import trustbo as tb
+
+
+def level():
+    return {level}
+
+
+def scene():
+    with open("level.txt") as file:
+        rate = float(file.read())
+    workspace = tb.Workspace.from_awareness(np.full((2, 3, 3, 1), 0.5))
+    truth = tb.models.TrustParams(0.0, np.zeros(1), rate + level(), 1e-3, 1e-3)
+    return tb.study.Scene(workspace, tb.simulation.ModelSimulator(workspace, truth), (2, 0), (0, 2))
+"""
+
+
+def test_processes_see_the_present_code_and_folder(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    module = tmp_path / "scenes_that_change.py"
+    rates = []
+    for site, rate, level in (("a", 0.1, 0.0), ("b", 0.5, 0.0), ("b", 0.5, 0.3)):
+        (tmp_path / site).mkdir(exist_ok=True)
+        (tmp_path / site / "level.txt").write_text(str(rate))
+        monkeypatch.chdir(tmp_path / site)
+        module.write_text(MODULE.format(level=level))
+        importlib.invalidate_caches()
+        scenes = importlib.reload(importlib.import_module("scenes_that_change"))
+
+        table = run_grid({"a": {"model": POOLED}}, {"s": scenes.scene}, f"out {level}",
+                         n_missions=1, n_jobs=2, seeds=2)  # fmt: skip
+        rates.append(table["contact_rate"].mean())
+    np.testing.assert_allclose(rates, [0.1, 0.5, 0.8], atol=0.05)
+
+
+def test_numbers_are_names_and_a_number_of_seeds_counts_from_0(tmp_path):
+    cases = {0.5: {"model": POOLED}, 1: {"model": POOLED}}
+    table = run_grid(cases, SCENES, tmp_path, seeds=np.int64(2), n_missions=1, n_jobs=1)
+    assert {*table["case"]} == {"0.5", "1"}
+    assert {*table["seed"]} == {0, 1}
+
+
+@pytest.mark.parametrize(
+    ("cases", "seeds"),
+    [
+        ({1: {}, "1": {}}, 1),
+        ([{}], 1),
+        ({"a": {}}, "12"),
+        ({"a": {}}, 0),
+        ({"a": {}}, True),
+        ({"a": {}}, [0.5]),
+        ({"a": {}}, [-1]),
+        ({"a": {}}, None),
+    ],
+)
+def test_names_and_seeds_that_are_unclear_are_refused(cases, seeds, tmp_path):
+    with pytest.raises(TrustboError):
+        run_grid(cases, SCENES, tmp_path, seeds=seeds, n_missions=1, n_jobs=1)
+    assert not list(tmp_path.iterdir())

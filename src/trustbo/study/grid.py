@@ -1,6 +1,7 @@
 """Grids of campaigns (cases x scenes x seeds) that run in parallel and can be resumed."""
 
 import copy
+import numbers
 import re
 import time
 import warnings
@@ -12,12 +13,21 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 from joblib import Parallel, delayed
+from joblib.externals.loky import get_reusable_executor
 from threadpoolctl import threadpool_limits
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.result import Result
 from trustbo.data import Cell
-from trustbo.errors import TrustboError, composed, require_count
+from trustbo.errors import (
+    TrustboError,
+    composed,
+    one_line,
+    require_count,
+    require_kind,
+    require_list,
+    require_whole,
+)
 from trustbo.files import FilePath, interpreting, to_path, write_text
 from trustbo.inference.functions.identity import fingerprint
 from trustbo.models.backend import VERSIONS
@@ -81,11 +91,11 @@ class _Run(NamedTuple):
 
 
 def run_grid(
-    cases: Mapping[str, Case],
-    scenes: Mapping[str, Callable[[], Scene]],
+    cases: Mapping[Any, Case],
+    scenes: Mapping[Any, Callable[[], Scene]],
     folder: FilePath,
     *,
-    seeds: Sequence[int] = (0,),
+    seeds: Sequence[int] | int = (0,),
     n_missions: int = 15,
     n_jobs: int = -1,
 ) -> pd.DataFrame:
@@ -97,16 +107,17 @@ def run_grid(
     Hashes cover values and the user's functions and classes, but neither files nor functions that
     are called as attributes of a module; use another folder after such changes.
 
-    Runs are parallelised with joblib; `joblib.parallel_config` selects another backend, such as
-    `backend="dask"` for a cluster. If the policy has a method `learn(campaign, mission)`, it is
-    called after each mission. If the policy has a method `recommend(campaign)`, its path replaces
-    the campaign's recommendation.
+    Runs are parallelised with joblib, in new processes that see the present code and working
+    directory. `joblib.parallel_config` selects another backend, such as `backend="dask"` for a
+    cluster, whose workers must be restarted after a change of code. If the policy has a method
+    `learn(campaign, mission)`, it is called after each mission. If the policy has a method
+    `recommend(campaign)`, its path replaces the campaign's recommendation.
 
     Args:
-        cases: Cases, keyed by name.
-        scenes: Functions, keyed by name, that make the scenes in the worker processes.
+        cases: Cases, keyed by name; other keys, such as numbers, become texts.
+        scenes: Functions, keyed in the same way, that make the scenes in the worker processes.
         folder: Folder for the files of the runs.
-        seeds: Seeds of the campaigns, without repeats.
+        seeds: Seeds of the campaigns, without repeats; a number n for 0 to n - 1.
         n_missions: Number of missions per campaign.
         n_jobs: Number of processes; -1 for one per core, 1 to use only this process.
 
@@ -130,6 +141,9 @@ def run_grid(
         >>> table = tb.study.run_grid(cases, scenes, "out", n_missions=2, n_jobs=1)
     """
     require_count("n_missions", n_missions)
+    cases = _named("cases", cases)
+    scenes = _named("scenes", scenes)
+    seeds = _seeds_of(seeds)
     # Here and not in a worker process, so that a hash does not depend on how its code was sent.
     of_cases = {name: _hash_of(name, case) for name, case in cases.items()}
     of_scenes = {name: _hash_of(name, scene) for name, scene in scenes.items()}
@@ -157,6 +171,9 @@ def run_grid(
     for run in runs:
         if run.file.exists():
             _read(run)  # refused before other runs begin
+    if n_jobs != 1:
+        # joblib keeps its workers, which would go on with old code in an old folder.
+        get_reusable_executor().shutdown(wait=True)
     try:
         errors = Parallel(n_jobs=n_jobs)(
             delayed(_try)(cases[run.case], scenes[run.scene], run, n_missions)
@@ -176,6 +193,26 @@ def run_grid(
             f"first errors are: {'; '.join(failed[:_N_SHOWN])}"
         )
     return pd.concat(map(_read, runs), ignore_index=True)
+
+
+def _named(what: str, given: Any) -> dict[str, Any]:
+    """Return cases or scenes with texts as names; raises TrustboError if two have one text."""
+    require_kind(what, given, Mapping, "give a dict with a name for each")
+    named = {str(name): one for name, one in given.items()}
+    if len(named) < len(given):
+        raise TrustboError(f"names of {what} must differ as texts; got {one_line(list(given))}.")
+    return named
+
+
+def _seeds_of(seeds: Any) -> list[int]:
+    """Return seeds as a list; a number n stands for 0 to n - 1."""
+    if isinstance(seeds, numbers.Integral):
+        return list(range(require_count("seeds", seeds)))
+    remedy = "give a number of seeds, or a list such as range(10)"
+    return [
+        require_whole(f"seeds[{k}]", seed, 0)
+        for k, seed in enumerate(require_list("seeds", seeds, remedy=remedy))
+    ]
 
 
 def _hash_of(name: str, value: Any) -> str:
