@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 from commands import call
 
@@ -89,6 +90,51 @@ def test_a_week_at_a_shell_is_that_of_a_campaign_in_python(ground, tmp_path, cap
     assert np.isclose(counted["contact_rate"].iloc[3], 0.5 * counted["contact_rate"].iloc[0])
 
 
+def test_what_is_closed_at_a_shell_is_avoided_until_it_is_reopened(ground, capsys):
+    week = ground / "week"
+    assert call("ask", week, "camp", "hill") == 0
+    path = asked(ground).path
+    cell, bound = f"{path[2][0]},{path[2][1]}", "camp/" + ",".join(map(str, path[1]))
+    capsys.readouterr()
+    words = "--reason", "wreck", "--until", "2099-12-03T08:00", "--by", "lead"
+    assert call("close", week, cell, bound, *words) == 0
+    said = capsys.readouterr().out
+    assert "closing 1: " in said
+    assert "call trustbo ask again" in said
+    assert call("status", week) == 0
+    assert "wreck" in capsys.readouterr().out
+    assert call("ask", week, "camp", "hill") == 0
+    assert path[2] not in asked(ground).path
+    assert asked(ground).path[1] != path[1]
+    assert call("reopen", week, 1, "--reason", "towed away") == 0
+    assert call("ask", week, "camp", "hill") == 0
+    assert asked(ground).path == path
+
+    assert call("close", week, "hill", "--reason", "fire", "--until", 99) == 0
+    capsys.readouterr()
+    assert call("ways", week, "camp", "hill") == 1
+    assert "hill (fire)" in capsys.readouterr().err
+    assert call("reopen", week, 2, "--reason", "put out") == 0
+    assert [one.until for one in tb.load_result(week).state.closings][1] == 99
+
+
+def test_mud_at_a_shell_teaches_no_slope(ground, capsys):
+    week = ground / "week"
+    before = float(tb.load_result(week).hazard["failures"].sum())
+    assert call("ask", week, "camp", "hill") == 0
+    where = ",".join(map(str, asked(ground).path[1]))
+    assert call("fail", week, "mud", "--where", where) == 0
+    assert call("ask", week, "camp", "hill") == 0
+    log = pd.read_csv(drive(ground, 7))
+    log = log[log["bound"] <= 2]
+    log.loc[log["bound"] == 2, "status"] = "stuck"
+    log.to_csv(ground / "mud.csv", index=False)
+    assert call("tell", week, ground / "mud.csv", "--cause", "mud") == 0
+    result = tb.load_result(week)
+    assert result.table()["reason"].tolist()[-2:] == ["mud", "mud (stuck)"]
+    assert float(result.hazard["failures"].sum()) == before
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -99,6 +145,11 @@ def test_a_week_at_a_shell_is_that_of_a_campaign_in_python(ground, tmp_path, cap
         ("tell", "week", "dem.tif"),
         ("fail", "week", ""),
         ("correct", "week", "9", "right.csv", "--reason", "none"),
+        ("close", "week", "9,9", "--reason", "wreck"),
+        ("close", "week", "0,0/2,2", "--reason", "wreck"),
+        ("close", "week", "1,1", "--reason", "wreck", "--until", "yesterday"),
+        ("close", "week", "1,1", "--reason", "wreck", "--until", "1"),
+        ("reopen", "week", "9", "--reason", "open"),
         ("status", "absent"),
         ("ways", "week", "camp", "camp"),
         ("resume", "week"),

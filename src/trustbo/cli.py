@@ -141,6 +141,8 @@ def _add_field_commands(command: Callable[..., Any]) -> None:
         add("--tick", type=float, default=1.0, metavar="S", help="seconds of a detector reading")
         text = "why tracks end early, such as stuck"
         add("--status", default="aborted", metavar="TEXT", help=text)
+        text = "why a bound failed, if it says nothing about other bounds, such as mud"
+        add("--cause", default="", metavar="TEXT", help=text)
 
     example = "--dem dem.tif --dsm dsm.tif --shape 12,10 --max-slope 18 --place camp=9,1"
     add = on_folder(new, "Begin a campaign of real robots on a ground.", example)
@@ -179,10 +181,29 @@ def _add_field_commands(command: Callable[..., Any]) -> None:
     add_log(add)
     add("--reason", required=True, metavar="TEXT", help="why the log was wrong")
 
+    _add_closings(on_folder)
+
     add = on_folder(field.status, "Show the ground and all missions.", "")
 
     add = on_folder(field.report, "Write a report as an HTML page.", "--out report.html")
     add("--out", type=Path, default=Path("report.html"), metavar="FILE", help="file to write")
+
+
+def _add_closings(on_folder: Callable[..., Any]) -> None:
+    """Add the commands that close and reopen cells and bounds."""
+    example = "3,6 2,1/1,1 --reason wreck --until 2026-12-03T08:00"
+    add = on_folder(field.close, "Close cells and bounds for plans.", example)
+    text = f"cell, or bound as CELL/CELL; a cell is {LOCATION}"
+    add("where", type=_closed, nargs="+", metavar="WHERE", help=text)
+    add("--reason", required=True, metavar="TEXT", help="such as wreck, or mud")
+    text = "time or number of a mission from which it is open again (default: for ever)"
+    add("--until", type=_until, metavar="TIME", help=text)
+    add("--by", default="", metavar="NAME", help="who reported it")
+
+    example = "1 --reason 'towed away'"
+    add = on_folder(field.reopen, "Reopen what was closed.", example)
+    add("closing", type=_count, metavar="N", help="number of the closing, as in status")
+    add("--reason", required=True, metavar="TEXT", help="why it is open again")
 
 
 def _add_campaign(add: Any, folder: str) -> None:
@@ -241,6 +262,17 @@ def place(text: str) -> tuple[int, int] | dict[str, float] | str:
         pairs = (part.split("=") for part in text.split(","))
         return {name.strip(): float(value) for name, value in pairs}
     return shape(text) if "," in text else text
+
+
+def _closed(text: str) -> Any:
+    """Parse a location, or a bound, such as "2,1/1,1"."""
+    ends = [place(end) for end in text.split("/")]
+    return ends[0] if len(ends) == 1 else ends
+
+
+def _until(text: str) -> str | int:
+    """Parse the number of a mission, or a time, which is returned as it is."""
+    return int(text) if text.isdecimal() else text
 
 
 def _named_place(text: str) -> tuple[str, Any]:

@@ -1,4 +1,4 @@
-"""Commands for campaigns of real robots: `ask`, `ways`, `tell`, `fail`, `correct`, and `status`.
+"""Commands for campaigns of real robots: `ask`, `ways`, `tell`, `fail`, `close`, and others.
 
 Each command loads the campaign from its folder, which is locked meanwhile, and does one thing.
 `trustbo new` begins the campaign. An error has recorded nothing.
@@ -89,7 +89,7 @@ def tell(args: Namespace) -> None:
     """Record the missions of a log, and print what they measured."""
     with loaded(args.folder) as campaign:
         for mission in _missions_in(args, campaign.workspace, campaign.state.asked):
-            campaign.tell(mission)
+            campaign.tell(mission, cause=args.cause)
             _print_last(campaign)
 
 
@@ -110,9 +110,30 @@ def correct(args: Namespace) -> None:
             raise TrustboError(
                 f"the log has {len(missions)} missions; give that of mission {args.mission} alone."
             )
-        campaign.correct(args.mission, missions[0], args.reason)
+        campaign.correct(args.mission, missions[0], args.reason, cause=args.cause)
         print(f"mission {args.mission} is excluded; the correction is the next mission:")
         _print_last(campaign)
+
+
+def close(args: Namespace) -> None:
+    """Close cells and bounds, and print the number of the closing."""
+    from trustbo.workspace.closed import closed_along, closed_text
+
+    with loaded(args.folder) as campaign:
+        n = campaign.close_off(args.where, args.reason, until=args.until, by=args.by)
+        closing = campaign.state.closings[n - 1]
+        what = closed_text(closing.closed, campaign.workspace.name_of)
+        print(f"closing {n}: {what}, {closing.until_text}")
+        asked = campaign.state.asked
+        if asked is not None and closed_along(closing.closed, asked.path):
+            print("the mission that is asked for uses it; call trustbo ask again")
+
+
+def reopen(args: Namespace) -> None:
+    """Reopen what a closing has closed."""
+    with loaded(args.folder) as campaign:
+        campaign.reopen(args.closing, args.reason)
+        print(f"closing {args.closing} no longer counts: {args.reason}")
 
 
 def status(args: Namespace) -> None:
@@ -123,6 +144,9 @@ def status(args: Namespace) -> None:
         table = campaign.table().filter(_STATUS)
         if len(table):
             print(table.to_string(float_format="%.2f", na_rep=""))
+        closings = campaign.closings()
+        if len(closings):
+            print(closings.to_string())
         asked = campaign.state.asked
         if asked is not None:
             name_of = campaign.workspace.name_of

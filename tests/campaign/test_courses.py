@@ -468,7 +468,7 @@ def test_a_mission_of_some_robots_is_followed_and_replanned(workspace):
         t += 3.0
     campaign.tell(follower.to_mission())
     [entry] = campaign.state.entries
-    assert (entry.course, entry.plan.is_replanned) == ((*ENDS, SOME), True)
+    assert (entry.course[:3], entry.plan.is_replanned) == ((*ENDS, SOME), True)
     assert campaign.table()["failed_bounds"].tolist() == [
         f"1 into {plan.path[1][0]},{plan.path[1][1]} (stuck)"
     ]

@@ -315,7 +315,7 @@ def test_contradictory_reports_of_failures_are_refused(workspace):
         ({"reason": ""}, "reason"),
         ({"reason": None}, "reason"),
         ({"reason": "stuck", "where": path[0]}, "where"),
-        ({"reason": "rain", "where": path[1]}, "where"),
+        ({"reason": "rain", "where": path[0]}, "where"),
     ):
         with pytest.raises(tb.TrustboError, match=named):
             campaign.fail(**arguments)

@@ -117,7 +117,8 @@ def template(workspace, tmp_path_factory):
 
 
 OPERATIONS = (
-    "tell", "fail", "exclude", "correct", "withdraw", "suggest", "replan", "ask", "ask back"
+    "tell", "fail", "exclude", "correct", "withdraw", "suggest", "replan", "ask", "ask back",
+    "close off", "reopen",
 )  # fmt: skip
 
 
@@ -133,7 +134,15 @@ def operations(campaign, mission):
         if not campaign.state.failures[0].withdrawn:
             campaign.withdraw(1, "wrong team")
 
+    def reopen():
+        if not campaign.state.closings:
+            campaign.close_off([(1, 1)], "wreck")
+        if not campaign.state.closings[0].reopened:
+            campaign.reopen(1, "towed away")
+
     return {
+        "close off": lambda: campaign.close_off([(1, 1), ((2, 0), (1, 0))], "mud", until=9),
+        "reopen": reopen,
         "tell": lambda: campaign.tell(mission),
         "fail": lambda: campaign.fail("stuck", where=campaign.ask().path[1]),
         "exclude": lambda: campaign.exclude(1, "the lidar was covered"),
@@ -151,7 +160,8 @@ def summary(campaign):
     asked = None if state.asked is None else (state.asked.path, state.asked.robots)
     counted = tuple(entry.why_excluded is not None for entry in state.entries)
     failures = tuple(bool(failure.withdrawn) for failure in state.failures)
-    return counted, failures, asked
+    closings = tuple((one.where, one.reason, bool(one.reopened)) for one in state.closings)
+    return counted, (failures, closings), asked
 
 
 def attempt(operation):
@@ -187,7 +197,7 @@ def check(folder, operate, mission, expected, fault):
         with fault:
             outcome = attempt(operations(campaign, mission)[operate])
         after = summary(campaign)
-        if operate in ("ask", "withdraw") and outcome != "done":
+        if operate in ("ask", "withdraw", "reopen") and outcome != "done":
             before = after  # they consist of two operations, of which one may be done
         assert after == before or outcome != "refused"
         assert reopened(folder, copy)[:2] == after[:2]

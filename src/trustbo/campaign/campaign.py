@@ -9,9 +9,9 @@ import xarray as xr
 
 from trustbo.campaign.choose import choose, warn_if_infeasible
 from trustbo.campaign.course import Course
-from trustbo.campaign.earlier import earlier_missions
+from trustbo.campaign.earlier import earlier_closings, earlier_missions
 from trustbo.campaign.folder import FolderStorage
-from trustbo.campaign.learning import AWARENESS, as_learned, require_new
+from trustbo.campaign.learning import AWARENESS, as_learned, require_new, with_cause
 from trustbo.campaign.past_failures import with_past_failures
 from trustbo.campaign.read import lock_campaign, read_campaign, warn_of_unrecorded
 from trustbo.campaign.recorder import Recorder
@@ -49,6 +49,7 @@ from trustbo.planning import NoPathError, Plan, Planner
 from trustbo.planning.policies import Policy, resolve_policy
 from trustbo.simulation.protocol import Simulator
 from trustbo.workspace import Workspace
+from trustbo.workspace.closed import closed_along
 from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import MOVES
 
@@ -135,7 +136,8 @@ class Campaign(Recorder):
             earlier: Results or campaigns whose missions are also data of this campaign, so that
                 their posterior is its prior. They may have other courses, terrains and teams.
                 Robots are matched by name. What was learned about places is used only if the map is
-                the same. A mission that several of them contain is used once.
+                the same, and so are closings that still count. A mission that several of them
+                contain is used once.
             progress: Whether to show progress bars for slow fits.
 
         Raises:
@@ -183,7 +185,9 @@ class Campaign(Recorder):
             fit=fit_options,
         )
 
-        state = State(settings, earlier=earlier_missions(earlier, workspace))
+        missions = earlier_missions(earlier, workspace)
+        closings = earlier_closings(earlier, workspace)
+        state = State(settings, closings=closings, earlier=missions)
         learner.require_poolable(state.earlier.missions, workspace.team.names)
         super().__init__(workspace, state, learner)
 
@@ -206,8 +210,9 @@ class Campaign(Recorder):
     ) -> Plan:
         """Plan the next path; further calls return the same plan until `tell`, `fail` or `suggest`.
 
-        A call with another course or other robots replaces the plan. The plan is recorded before it
-        is returned.
+        A call with another course or other robots replaces the plan, and so does a call after the
+        plan was closed off, or after something was reopened that it had to avoid. The plan is
+        recorded before it is returned.
 
         Args:
             start: First cell, or a position in this cell; see `Workspace.locate`. By default, that
@@ -231,10 +236,10 @@ class Campaign(Recorder):
         with self._turn:
             asked = self.state.asked
             if asked is not None and start is None and goal is None and robots is None:
-                return asked
-
-            course = self._course(start, goal, robots, usual=self._own_ends)
-            if asked is not None and course == Course.of(asked):
+                course = Course.of(asked)._replace(closed=self._closed)
+            else:
+                course = self._course(start, goal, robots, usual=self._own_ends)
+            if asked is not None and _holds(asked, course):
                 return asked
 
             plan = self._propose(course)
@@ -326,7 +331,8 @@ class Campaign(Recorder):
             >>> campaign.replan((2, 1), so_far)  # the team is stuck on its way to (1, 2)
         """
         with self._turn:
-            plan = self.ask()
+            asked = self.state.asked
+            plan = self.ask() if asked is None else asked
             self._learn()
             cell = self.workspace.locate(cell, "cell")
             if so_far is not None:
@@ -334,7 +340,7 @@ class Campaign(Recorder):
                 so_far = self._in_order(so_far, plan.robots)
             closed = require_bounds("blocked", blocked)
 
-            base = self._base_of(Course.of(plan))
+            base = self._base_of(Course.of(plan)._replace(closed=self._closed))
             plan = plan_rest(self, base, self.policy, plan, cell, so_far, closed)
             self._accept(plan)
             return plan
@@ -344,7 +350,7 @@ class Campaign(Recorder):
         self._record(asked=plan)
         warn_if_infeasible(plan)
 
-    def tell(self, mission: Mission, *, again: bool = False) -> xr.DataTree | None:
+    def tell(self, mission: Mission, *, again: bool = False, cause: str = "") -> xr.DataTree | None:
         """Record a mission and learn from it.
 
         For learning, the awareness of the map replaces the measured awareness, unless the campaign
@@ -356,6 +362,9 @@ class Campaign(Recorder):
             mission: Measured mission, whether or not it reached the goal.
             again: Whether to accept a mission with the same data as an earlier one. By default,
                 such a mission is refused, because it was probably told twice.
+            cause: Cause of a failure that says nothing about other bounds and the slope limit, such
+                as "mud". Bounds that failed are then recorded as "aborted", from which no failure
+                probability is learned. To keep the team away, `close_off` the cell.
 
         Returns:
             Posterior of the parameters given all usable missions. If this mission cannot be used
@@ -364,8 +373,8 @@ class Campaign(Recorder):
         Raises:
             TrustboError: The robots differ from those of the plan, or the features from the
                 workspace's; the path leaves the grid or skips cells; no path leads from its start
-                to its end; the mission was told before; or it cannot be written. The mission is
-                then not recorded.
+                to its end; the mission was told before; a cause is given, but no bound failed; or
+                it cannot be written. The mission is then not recorded.
 
         Warns:
             UserWarning: The mission began or ended elsewhere than planned; it is recorded but
@@ -377,12 +386,15 @@ class Campaign(Recorder):
             self.storage.require_open()
             asked = self.state.asked
             mission = self._in_order(mission, None if asked is None else asked.robots)
+            mission, cause = with_cause(mission, cause)
             if not again:
                 require_new(self.state, mission)
 
-            return self._add(mission, asked)
+            return self._add(mission, asked, cause=cause)
 
-    def correct(self, n: int, mission: Mission, reason: str) -> xr.DataTree | None:
+    def correct(
+        self, n: int, mission: Mission, reason: str, *, cause: str = ""
+    ) -> xr.DataTree | None:
         """Replace a mission whose log was wrong, and learn from the corrected one.
 
         The wrong mission is excluded, with the reason, and the corrected one is recorded under the
@@ -392,6 +404,7 @@ class Campaign(Recorder):
             n: Number of the wrong mission, from 1.
             mission: Corrected mission, as for `tell`.
             reason: Reason to store in the table of missions.
+            cause: Cause of a failure, as for `tell`.
 
         Returns:
             Posterior, as for `tell`.
@@ -408,13 +421,17 @@ class Campaign(Recorder):
             self._require_mission(n, reason)
             entries = self.state.entries
             plan = entries[n - 1].plan
-            mission = self._in_order(mission, plan.robots)
+            mission, cause = with_cause(self._in_order(mission, plan.robots), cause)
             require_new(self.state, mission)
             reason = f"corrected, see mission {len(entries) + 1}: {reason}"
-            return self._add(mission, plan, (n, reason))
+            return self._add(mission, plan, (n, reason), cause)
 
     def _add(
-        self, mission: Mission, asked: Plan | None, wrong: tuple[int, str] | None = None
+        self,
+        mission: Mission,
+        asked: Plan | None,
+        wrong: tuple[int, str] | None = None,
+        cause: str = "",
     ) -> xr.DataTree | None:
         """Record a mission and learn from it.
 
@@ -423,6 +440,7 @@ class Campaign(Recorder):
             asked: Plan of the mission; None if no path was asked for.
             wrong: Number of the mission that it corrects, which is excluded in the same step, and
                 the reason; None if it corrects none.
+            cause: Cause of a failure from which nothing is learned; see `with_cause`.
         """
         learned = as_learned(mission, self.workspace, self.state.settings["awareness"])
         if mission.robots != self.workspace.team.names:
@@ -433,7 +451,7 @@ class Campaign(Recorder):
 
         before = self.state
         entries = before.entries if wrong is None else self._excluding(*wrong)
-        entry = Entry(plan, mission, learned, trust_map, posterior=before.last)
+        entry = Entry(plan, mission, learned, trust_map, cause, posterior=before.last)
         recorded = f"mission {len(entries) + 1} is recorded"
         try:
             self._record(entries=(*entries, entry), asked=None)
@@ -495,9 +513,15 @@ class Campaign(Recorder):
         if ends is not None and start == ends[0] and (mission.status != "ok" or last == ends[1]):
             if asked is not None:
                 return asked
-            return self._propose(self._course(*ends, mission.robots, usual=None))
+            course = self._course(*ends, mission.robots, usual=None)
+            try:
+                return self._propose(course)
+            except NoPathError:  # unless the way was closed since
+                return self._propose(course._replace(closed=tuple(self.workspace.closed.items())))
 
+        # What is closed now may have been open then, and was driven anyway.
         course = self._course(start, last, mission.robots, usual=None)
+        course = course._replace(closed=tuple(self.workspace.closed.items()))
         self.storage.require_open()
         self._learn()
         try:
@@ -522,14 +546,14 @@ class Campaign(Recorder):
         Args:
             reason: Reason to store in the table of missions. Reasons in `hazard.CAUSES`, such as
                 "stuck", mean that a bound of the plan failed, and only these are used to learn the
-                hazard.
+                hazard. Other reasons, such as "mud", say nothing about the slope; to keep the team
+                away, `close_off` the cell.
             where: Cell that the team failed to enter, if known.
 
         Raises:
             TrustboError: The reason is empty or contains a cause without being one, such as "got
                 stuck"; a bound failed although no path is planned; the plan does not enter `where`;
-                `where` is given but the reason is not in `hazard.CAUSES`; or the failure cannot be
-                recorded. The failure is then not counted.
+                or the failure cannot be recorded. The failure is then not counted.
         """
         if not isinstance(reason, str) or not reason.strip():
             raise TrustboError(f"reason must be a text such as {CAUSES[0]!r}; got {reason!r}.")
@@ -544,19 +568,20 @@ class Campaign(Recorder):
 
         with self._turn:
             self.storage.require_open()
-            if reason in CAUSES and self.state.asked is None:
+            asked = self.state.asked
+            at_a_bound = reason in CAUSES or where is not None
+            if at_a_bound and asked is None:
                 raise TrustboError(
                     f"no path is planned on which a bound can have failed ({reason}). Call ask "
                     "before the mission is run; a mission that was told with this status already "
                     "counts as a failure."
                 )
-            path = self.ask().stations if reason in CAUSES or where is not None else ()
+            path = asked.stations if at_a_bound and asked is not None else ()
             where = None if where is None else require_pair("where", where)
             entered = tuple(cells_of(path[1:]))
-            if where is not None and (reason not in CAUSES or where not in entered):
+            if where is not None and where not in entered:
                 raise TrustboError(
-                    f"where = {where} must be a cell that the plan enters, {entered}, with one of "
-                    f"the reasons {', '.join(CAUSES)}; got reason {reason!r}."
+                    f"where = {where} must be a cell that the plan enters; these are {entered}."
                 )
 
             self._learn()
@@ -686,9 +711,24 @@ class Campaign(Recorder):
         return campaign
 
 
+def _holds(asked: Plan, course: Course) -> bool:
+    """Return whether a plan that was asked for is still a plan of a course.
+
+    A mission that was replanned is on its way; `replan` plans around what was closed since.
+    """
+    before = Course.of(asked)
+    if before._replace(closed=course.closed) != course:
+        return False
+    if asked.is_replanned:
+        return True
+    closed = dict(course.closed)
+    reopened = dict(before.closed).keys() - closed.keys()
+    return not reopened and not closed_along(closed, asked.path)
+
+
 def _any_ends(workspace: Workspace) -> tuple[Cell, Cell]:
     """Return the ends of a bound, for a planner that checks the options of a campaign."""
-    bounds = np.argwhere(workspace.passable_bounds.values)
+    bounds = np.argwhere(workspace.open_bounds)
     if not len(bounds):
         raise TrustboError("the robots can drive no bound of this workspace; choose another team.")
 

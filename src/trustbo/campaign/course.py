@@ -13,16 +13,18 @@ class Course(NamedTuple):
         start: First cell.
         goal: Last cell.
         robots: Robots of T2 that take part, in the order of the team.
+        closed: Closed cells and bounds with their reasons, as in `Workspace.closed`.
     """
 
     start: Cell
     goal: Cell
     robots: tuple[str, ...]
+    closed: tuple[tuple[tuple[Cell, ...], str], ...] = ()
 
     @classmethod
     def of(cls, plan: Plan) -> Self:
         """Return the course of a plan."""
-        return cls(plan.start, plan.goal, plan.robots)
+        return cls(plan.start, plan.goal, plan.robots, tuple(plan.workspace.closed.items()))
 
     @property
     def ends(self) -> tuple[Cell, Cell]:

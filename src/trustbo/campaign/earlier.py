@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+from trustbo.campaign.closing import Closing
 from trustbo.campaign.result import Result
 from trustbo.campaign.state import (
     EarlierMissions,
@@ -88,6 +89,26 @@ def _missions_of(result: Result) -> EarlierMissions:
         (*state.earlier.planned, *(planned_paths(entry.plan) for entry in own)),
         tuple(state.lost),
     )
+
+
+def earlier_closings(
+    earlier: Result | Sequence[Result] | None, workspace: Workspace
+) -> tuple[Closing, ...]:
+    """Return the closings of earlier campaigns on the same map that still count.
+
+    A closing that ends with a mission lasts for as many missions as were left.
+    """
+    results = [earlier] if isinstance(earlier, Result) else earlier or []
+    here = map_name(workspace)
+    found: dict[Closing, None] = {}  # in order, each once
+    for result in results:
+        n_next = len(result.state.entries) + 1
+        if map_name(result.workspace) != here:
+            continue
+        for closing in result.state.closings:
+            if not closing.why_over(n_next):
+                found[closing.after(n_next - 1)] = None
+    return tuple(found)
 
 
 class _Source(NamedTuple):

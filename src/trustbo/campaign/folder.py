@@ -6,7 +6,7 @@
     missions/0001.nc      measurements and plan of the first mission, written before learning
     posteriors/0001.nc    draws of the parameters after the first mission; 0000.nc contains those
                           given the missions of earlier campaigns, if there are any
-    campaign.json         settings, exclusions, failures, and hashes of the other files
+    campaign.json         settings, exclusions, failures, closings, and hashes of the other files
 
 Files are only added; campaign.json, which lists them with their hashes, is replaced. Every file is
 written under a temporary name, flushed to disk and renamed, and campaign.json comes last: what it
@@ -240,7 +240,7 @@ def _contents(
 def _entry_to_tree(entry: Entry) -> xr.DataTree:
     """Convert a mission with its plan to a data tree."""
     planned = xr.Dataset({"trust_map": entry.trust_map})
-    planned.attrs = {"plan": to_json(plan_to_record(entry.plan))}
+    planned.attrs = {"plan": to_json(plan_to_record(entry.plan)), "cause": entry.cause}
     tree = missions_to_tree([entry.measured])
     tree["planned"] = xr.DataTree(planned)
     return tree

@@ -18,6 +18,7 @@ from trustbo.data import OF_BOUNDS, Cell, Mission, Station, cells_of
 from trustbo.errors import PosteriorError, TrustboError, warn
 from trustbo.hazard import Hazard
 from trustbo.hazard.model import fit_hazard
+from trustbo.hazard.trials import CAUSES
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.fit import fit
 from trustbo.inference.learner import Learner
@@ -66,6 +67,28 @@ def as_learned(mission: Mission, workspace: Workspace, awareness: str) -> Missio
     whole = learned.with_robots(team)
     went = np.isin(team, mission.robots)[:, None]
     return whole.with_awareness(np.where(went, whole.awareness, of_team))
+
+
+def with_cause(mission: Mission, cause: str) -> tuple[Mission, str]:
+    """Return a mission whose failures say nothing about other bounds, and a text of their cause.
+
+    Bounds that failed become aborted ones. Without a cause, the mission is returned unchanged.
+
+    Raises:
+        TrustboError: The cause is not a text, or no bound failed.
+    """
+    if not isinstance(cause, str):
+        raise TrustboError(f"cause must be a text such as 'mud'; got {cause!r}.")
+    if not cause.strip():
+        return mission, ""
+
+    failed = [status for status in mission.statuses if status in CAUSES]
+    if not failed:
+        raise TrustboError(f"cause = {cause!r} is given, but no bound failed; leave it out.")
+    statuses = tuple("aborted" if one in CAUSES else one for one in mission.bound_status)
+    status = "aborted" if mission.status in CAUSES else mission.status
+    text = f"{cause.strip()} ({', '.join(dict.fromkeys(failed))})"
+    return replace(mission, bound_status=statuses, status=status), text
 
 
 def require_new(state: State, mission: Mission) -> None:

@@ -81,7 +81,8 @@ def read_campaign(directory: FilePath) -> tuple[State, Workspace, dict[str, str]
         planned = tree["planned"].to_dataset()
         plan = plan_from_record(json.loads(planned.attrs["plan"]), workspace)
         learned = as_learned(measured, workspace, awareness)
-        entries.append(Entry(plan, measured, learned, planned["trust_map"]))
+        cause = planned.attrs["cause"]
+        entries.append(Entry(plan, measured, learned, planned["trust_map"], cause))
 
     state = state_from_record(record, entries, folder, workspace)
     if EARLIER in files:

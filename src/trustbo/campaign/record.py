@@ -1,4 +1,4 @@
-"""The file campaign.json: settings, exclusions, posteriors, failures, and hashes of all files."""
+"""The file campaign.json: settings, what users reported, posteriors, and hashes of all files."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from trustbo.campaign.closing import Closing
 from trustbo.campaign.state import Entry, Exclusion, Failure, Posterior, State
 from trustbo.errors import TrustboError
 from trustbo.files import hash_of, interpreting, read_file, to_json
 from trustbo.models.backend import VERSIONS
-from trustbo.planning.plan import plan_from_record, plan_to_record
+from trustbo.planning.plan import as_tuples, plan_from_record, plan_to_record
 from trustbo.workspace import Workspace
 
 RECORD = "campaign.json"
@@ -74,6 +75,7 @@ def record_to_bytes(state: State, files: Mapping[str, str]) -> bytes:
         "fitted": state.fitted,
         "why_not": state.why_not,
         "failures": state.failures,
+        "closings": state.closings,
         "stop_reason": state.stop_reason,
         "files": files,
     }
@@ -135,12 +137,17 @@ def state_from_record(
         cell = None if where is None else tuple(where)
         failures.append(Failure(after, reason, cells, cell, withdrawn))
 
+    closings = []
+    for where, *others in record["closings"]:
+        closings.append(Closing(as_tuples(where), *others))
+
     asked = record["asked"]
     fitted = record["fitted"]
     return State(
         settings=record["settings"],
         entries=tuple(complete),
         failures=tuple(failures),
+        closings=tuple(closings),
         asked=None if asked is None else plan_from_record(asked, workspace),
         simulation=record["simulation"],
         stop_reason=record["stop_reason"],

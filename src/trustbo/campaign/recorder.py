@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import datetime
 from typing import Any, Self
 
 import xarray as xr
 
+from trustbo.campaign.closing import closing_of
 from trustbo.campaign.folder import FolderStorage, MemoryStorage
 from trustbo.campaign.learning import with_posterior
 from trustbo.campaign.result import Result
@@ -14,6 +16,7 @@ from trustbo.errors import TrustboError, require_switch, require_whole, warn
 from trustbo.files import FilePath, holding_interrupts
 from trustbo.inference.learner import Learner
 from trustbo.workspace import Workspace
+from trustbo.workspace.closed import require_closed
 
 
 class Recorder(Result):
@@ -159,6 +162,69 @@ class Recorder(Result):
             failures[n - 1] = failures[n - 1]._replace(withdrawn=reason)
             self._record(failures=tuple(failures), asked=None)
 
+    def close_off(
+        self,
+        where: Sequence[Any],
+        reason: str,
+        *,
+        until: str | datetime | int | None = None,
+        by: str = "",
+    ) -> int:
+        """Close cells and bounds, such as a way that is blocked by a wreck.
+
+        Plans of `ask`, `plan`, `ways` and `replan` do not use them; see `Workspace.closing`. If the
+        plan that was asked for does, `ask` plans again. Nothing is learned from a closing, and
+        missions that used what is closed are accepted.
+
+        Args:
+            where: Cells, and bounds as pairs of neighbouring cells; or positions, or names of
+                places.
+            reason: Reason to show in messages and tables.
+            until: Time from which the closing no longer counts, such as "2026-12-03T08:00" (local
+                time unless it names a time zone; a date begins at midnight); or the number of the
+                first mission for which it no longer counts. By default, it has no end.
+            by: Who reported it.
+
+        Returns:
+            Number of the closing, for `reopen`.
+
+        Raises:
+            TrustboError: A cell is off the grid or impassable, cells are no neighbours, the reason
+                is empty, `until` has passed, or the closing cannot be recorded.
+
+        Example:
+            >>> n = campaign.close_off([(3, 4), ((2, 1), (1, 1))], "wreck", until="2099-12-03")
+            >>> campaign.reopen(n, "towed away")
+        """
+        with self._turn:
+            self.storage.require_open()
+            _require_reason(reason)
+            closed = require_closed(where, reason, self.workspace.locate)
+            n_next = len(self.state.entries) + 1
+            closing = closing_of(closed, reason, until, by, n_next)
+            self._record(closings=(*self.state.closings, closing))
+            return len(self.state.closings)
+
+    def reopen(self, n: int, reason: str) -> None:
+        """Reopen what was closed; `ask` then plans again.
+
+        Args:
+            n: Number of the closing, as in `closings`.
+            reason: Reason to store in the table of closings.
+
+        Raises:
+            TrustboError: There is no such closing, it no longer counts, the reason is empty, or
+                this cannot be recorded. The closing then still counts.
+        """
+        with self._turn:
+            closings = list(self.state.closings)
+            n_next = len(self.state.entries) + 1
+            before = [one.why_over(n_next) for one in closings]
+            self._require_counts("closing", n, reason, before, "open")
+
+            closings[n - 1] = closings[n - 1]._replace(reopened=reason)
+            self._record(closings=tuple(closings))
+
     def _require_counts(
         self, what: str, n: int, reason: str, before: Sequence[str | None], done: str
     ) -> None:
@@ -174,8 +240,7 @@ class Recorder(Result):
         self.storage.require_open()
         if require_whole("n", n, 1) > len(before):
             raise TrustboError(f"there is no {what} with number {n}; there are {len(before)}.")
-        if not isinstance(reason, str) or not reason.strip():
-            raise TrustboError(f"reason must be a text that is not empty; got {reason!r}.")
+        _require_reason(reason)
         if before[n - 1]:
             raise TrustboError(f"{what} {n} is already {done}: {before[n - 1]}")
 
@@ -199,3 +264,9 @@ class Recorder(Result):
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+
+def _require_reason(reason: object) -> None:
+    """Raise TrustboError unless a reason is a text that is not empty."""
+    if not isinstance(reason, str) or not reason.strip():
+        raise TrustboError(f"reason must be a text that is not empty; got {reason!r}.")

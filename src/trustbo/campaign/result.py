@@ -36,6 +36,7 @@ from trustbo.planning.ways import Ways, ways_of
 from trustbo.simulation import Truth
 from trustbo.stacking import padded
 from trustbo.workspace import Workspace
+from trustbo.workspace.closed import closed_text
 from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import cells_along, posts_along
 
@@ -111,6 +112,7 @@ class Result(Summary):
             ("course", self._course_text()),
             ("missions", ", ".join(shown) or "none yet"),
             *self._rows_of_earlier(),
+            *self._rows_of_closings(),
             ("model", settings["model"]),
             ("policy", f"{settings['policy']}, objective {settings['objective']}"),
         ]
@@ -138,6 +140,13 @@ class Result(Summary):
             return []
         n_here = sum(not mission.map for mission in missions)
         return [("earlier missions", f"{n_here} on this map, {len(missions) - n_here} elsewhere")]
+
+    def _rows_of_closings(self) -> Rows:
+        n_next = len(self.state.entries) + 1
+        name_of = self.workspace.name_of
+        counting = [one for one in self.state.closings if not one.why_over(n_next)]
+        texts = [f"{closed_text(one.closed, name_of)} {one.until_text}" for one in counting]
+        return [("closed", "; ".join(texts))] if texts else []
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -287,7 +296,12 @@ class Result(Summary):
             found.append(self.workspace.locate(place, name))
 
         team = self.workspace if robots is None else self.workspace.of_robots(robots)
-        return Course(found[0], found[1], team.team.names)
+        return Course(found[0], found[1], team.team.names, self._closed)
+
+    @property
+    def _closed(self) -> tuple[tuple[tuple[Cell, ...], str], ...]:
+        """What is closed for the next mission now, as in `Course`."""
+        return tuple((self.workspace.closed | self.state.closed).items())
 
     def _base_of(self, course: Course) -> Planner:
         """Return the planner of a course before any learning."""
@@ -295,7 +309,8 @@ class Result(Summary):
             if course not in self._bases:
                 while len(self._bases) >= _MOST_BASES:
                     del self._bases[next(iter(self._bases))]
-                team = self.workspace.of_robots(course.robots)
+                ground = self.workspace.with_closed(dict(course.closed))
+                team = ground.of_robots(course.robots)
                 self._bases[course] = to_planner(self.state.settings, team, *course.ends)
             return self._bases[course]
 
@@ -404,11 +419,15 @@ class Result(Summary):
 
     @property
     def courses(self) -> list[Course]:
-        """Courses of all missions and of the plan that is asked for, each once, in order."""
+        """Courses of all missions and of the plan that is asked for, each once, in order.
+
+        They have the cells and bounds that are closed now.
+        """
         plans = [entry.plan for entry in self.state.entries]
         if self.state.asked is not None:
             plans.append(self.state.asked)
-        return list(dict.fromkeys(Course.of(plan) for plan in plans))
+        closed = self._closed
+        return list(dict.fromkeys(Course.of(plan)._replace(closed=closed) for plan in plans))
 
     def trust(
         self,
@@ -656,6 +675,18 @@ class Result(Summary):
             names = {path_text([cell]): name for cell, name in self.workspace.place_in.items()}
             table[["start", "goal"]] = table[["start", "goal"]].replace(names)
         return table.astype({"mission": "Int64"}).set_index("mission")
+
+    def closings(self) -> pd.DataFrame:
+        """Return a table of the closings, numbered from 1; see `Campaign.close_off`.
+
+        The columns are `where`, `reason`, `until` (a time, the number of a mission, or empty), `at`
+        (time of the report), `by`, and `over`, why it no longer counts, or empty if it counts.
+        """
+        n_next = len(self.state.entries) + 1
+        rows = [one.row(n_next, self.workspace.name_of) for one in self.state.closings]
+        columns = ["where", "reason", "until", "at", "by", "over"]
+        numbers = pd.RangeIndex(1, len(rows) + 1, name="closing")
+        return pd.DataFrame(rows, numbers, columns)
 
     @computing()
     def maps(self, *, n_draws: int = 250, expected: bool = False) -> xr.Dataset:

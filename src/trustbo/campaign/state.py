@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+from trustbo.campaign.closing import Closing, closed_by
 from trustbo.campaign.course import Course
 from trustbo.data import Cell, Mission, Station, cells_of, path_text, split_path
 from trustbo.errors import TrustboError
 from trustbo.files import read_file
-from trustbo.hazard.trials import LostMission
+from trustbo.hazard.trials import CAUSES, LostMission
 from trustbo.logs.netcdf import read_tree
 from trustbo.planning import Plan
 
@@ -38,7 +39,8 @@ class Failure(NamedTuple):
         after: Number of missions recorded before it.
         reason: Reason, one of `hazard.CAUSES` if a bound failed.
         path: Stations of the planned path, start first; empty if no bound caused the failure.
-        where: Cell that the team failed to enter, if known.
+        where: Cell that the team failed to enter, if known. With a reason that is no cause of
+            failures, such as "mud", it is known, but nothing is learned from it.
         withdrawn: Reason why a user has withdrawn the report, or an empty string.
     """
 
@@ -51,7 +53,7 @@ class Failure(NamedTuple):
     @property
     def lost(self) -> LostMission | None:
         """The mission for the hazard; None if no bound failed or the report is withdrawn."""
-        is_used = self.path and not self.withdrawn
+        is_used = self.path and self.reason in CAUSES and not self.withdrawn
         return LostMission(self.path, self.where) if is_used else None
 
     def row(self) -> dict[str, Any]:
@@ -61,7 +63,7 @@ class Failure(NamedTuple):
         course = {n: path_text([a[:2]]) for n, a in zip(("start", "goal"), ends, strict=False)}
         return {
             **course,
-            "status": self.reason if self.path else "aborted",
+            "status": self.reason if self.reason in CAUSES else "aborted",
             "state": EXCLUDED if self.withdrawn else GIVEN_UP,
             "reason": self.withdrawn or self.reason,
             "where": where,
@@ -188,6 +190,8 @@ class Entry:
         measured: Mission with the measured awareness.
         mission: Mission with the awareness used for learning; see `learning.as_learned`.
         trust_map: Trust map used for planning, dims (row, col).
+        cause: What a user says about bounds that failed and from which no failure is learned, such
+            as "mud (stuck)"; see `Campaign.tell`. They are aborted in both missions.
         exclusion: Exclusion by a user; None if there was none.
         posterior: Posterior after this mission; None if there is none yet.
     """
@@ -196,6 +200,7 @@ class Entry:
     measured: Mission
     mission: Mission
     trust_map: xr.DataArray
+    cause: str = ""
     exclusion: Exclusion | None = None
     posterior: Posterior | None = None
 
@@ -254,6 +259,7 @@ class State:
         settings: Arguments of the campaign, JSON-serialisable.
         entries: Recorded missions, in order.
         failures: Missions that were given up.
+        closings: Cells and bounds that users closed, also those that no longer count.
         asked: Plan returned by `ask` and not run yet.
         simulation: Settings reported by the simulator, and `n_iterations`.
         stop_reason: Reason why the last run ended.
@@ -266,6 +272,7 @@ class State:
     settings: dict[str, Any]
     entries: tuple[Entry, ...] = ()
     failures: tuple[Failure, ...] = ()
+    closings: tuple[Closing, ...] = ()
     asked: Plan | None = None
     simulation: dict[str, Any] = field(default_factory=dict)
     stop_reason: str = "interrupted"
@@ -300,6 +307,11 @@ class State:
         """Missions without measurements in which a bound failed, earlier campaigns' first."""
         own = [failure.lost for failure in self.failures if failure.lost is not None]
         return [*self.earlier.lost, *own]
+
+    @property
+    def closed(self) -> dict[tuple[Cell, ...], str]:
+        """What is closed for the next mission now, as in `Workspace.closed`."""
+        return closed_by(self.closings, len(self.entries) + 1)
 
     def status_of(self, j: int) -> tuple[str, str]:
         """Return the state of the mission with index j, and the reason for it, which may be ""."""
@@ -347,7 +359,9 @@ class State:
         entry = self.entries[j]
         state, reason = self.status_of(j)
         failed = incomplete_bounds(entry.mission)
-        if not reason:
+        if not reason and entry.cause:
+            reason = entry.cause
+        elif not reason:
             reason = ", ".join(dict.fromkeys(status for _, _, status in failed))
 
         posterior = entry.posterior

@@ -66,7 +66,7 @@ class RegretBound:
 
         risk = campaign.risk
         least = 1.0
-        for course in dict.fromkeys(entry.course for entry in campaign.state.entries):
+        for course in campaign.courses:
             sure = [self.probability(campaign, n - k, course) for k in range(_N_SURE)]
             if min(sure) < 1.0 - self.delta:
                 return None

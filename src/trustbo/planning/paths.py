@@ -9,10 +9,11 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from trustbo.data import POST_SETS, Cell, Station, require_path
+from trustbo.data import POST_SETS, Cell, Station, path_text, require_path
 from trustbo.errors import TrustboError, one_line, require_kind, require_whole
 from trustbo.planning.unrolled import Committed, Unrolled, committed
 from trustbo.workspace import Workspace
+from trustbo.workspace.closed import closed_along, closed_text
 from trustbo.workspace.grid import Location
 from trustbo.workspace.moves import (
     MOVES,
@@ -91,7 +92,7 @@ class AdmissiblePaths:
 
         self.avoided = avoided
         self.blocked = blocked
-        self.bounds = workspace.passable_bounds.values
+        self.bounds = workspace.open_bounds
         for closed in (avoided, blocked):
             if closed is not None:
                 self.bounds = self.bounds & ~closed
@@ -136,6 +137,11 @@ class AdmissiblePaths:
         """Return a sentence with advice if no path leads to the goal."""
         if self.blocked is not None:
             return f"{int(self.blocked.sum())} bounds are blocked."
+
+        drivable = self.workspace.passable_bounds.values
+        if self.workspace.closed and fewest_bounds(drivable, self.goal, back=True)[self.start] > 0:
+            closed = closed_text(self.workspace.closed, self.workspace.name_of)
+            return f"All ways are closed: {closed}. Reopen one of them, or choose another goal."
 
         posts = self.workspace.posts
         terrain = self.workspace.terrain
@@ -250,7 +256,7 @@ class AdmissiblePaths:
             bounds: Mask of the bounds to avoid, shape (move, row, col).
             risk: Failure probability of each bound, shape (move, row, col).
         """
-        avoided = bounds & self.workspace.passable_bounds.values
+        avoided = bounds & self.workspace.open_bounds
         if self.avoided is not None:
             avoided |= self.avoided
 
@@ -298,6 +304,13 @@ class AdmissiblePaths:
         if len(cells) < 2 or (cells[0][:2], cells[-1][:2]) != (self.start, self.goal):
             raise TrustboError(
                 f"a path must lead from {self.start} to {self.goal}; got {one_line(list(cells))}."
+            )
+
+        closed = closed_along(self.workspace.closed, cells)
+        if closed:
+            raise TrustboError(
+                f"the path {path_text(cells)} takes what is closed: "
+                f"{closed_text(closed, self.workspace.name_of)}. Give another path, or reopen it."
             )
 
         drivable = self.workspace.passable_bounds.values

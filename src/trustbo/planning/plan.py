@@ -24,6 +24,7 @@ from trustbo.errors import require_switch
 from trustbo.fixed import Fixed, mark
 from trustbo.hazard.path_risk import PathRisk
 from trustbo.workspace import Workspace
+from trustbo.workspace.closed import closed_text
 from trustbo.workspace.moves import cells_along, posts_along
 
 QUANTILES = (0.05, 0.25, 0.75, 0.95)
@@ -147,6 +148,9 @@ class Plan(Fixed, Summary):
         if self.p_arrive is not None:
             beyond = "; the failure probability exceeds max_failure" if self.infeasible else ""
             rows.append(("arrival probability", f"{self.p_arrive:.3g}{beyond}"))
+        if self.workspace.closed:
+            closed = closed_text(self.workspace.closed, self.workspace.name_of)
+            rows.append(("closed", closed))
         if self.past_failures:
             rows.append(("past failures", "; ".join(past_failures_of(self))))
         if not np.isnan(self.limit):
@@ -349,10 +353,11 @@ def _when(failures: Sequence[PastFailure]) -> str:
 
 
 def plan_to_record(plan: Plan) -> dict[str, Any]:
-    """Convert a plan, with its robots but without its workspace, to plain lists and numbers."""
+    """Convert a plan to plain lists and numbers, with robots and closings for its workspace."""
     values = {f.name: getattr(plan, f.name) for f in fields(plan) if f.name != "workspace"}
     values["risk"] = None if plan.risk is None else plan.risk.to_record()
     values["robots"] = list(plan.robots)
+    values["closed"] = [*plan.workspace.closed.items()]
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else value
         for name, value in values.items()
@@ -362,9 +367,11 @@ def plan_to_record(plan: Plan) -> dict[str, Any]:
 def plan_from_record(record: dict[str, Any], workspace: Workspace) -> Plan:
     """Restore a plan of a workspace from a record made by `plan_to_record`.
 
-    Without the key `robots`, all robots of the workspace take part.
+    Without the key `robots`, all robots of the workspace take part; without `closed`, nothing is
+    closed but what the workspace closes.
     """
     values = {name: as_tuples(value) for name, value in record.items()}
+    workspace = workspace.with_closed(dict(values.pop("closed", workspace.closed.items())))
     workspace = workspace.of_robots(values.pop("robots", workspace.team.names))
     values |= {name: np.array(record[name]) for name in ("trust", "bands")}
     values["risk"] = record["risk"] and PathRisk.from_record(record["risk"])

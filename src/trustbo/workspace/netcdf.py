@@ -47,6 +47,7 @@ def workspace_to_tree(workspace: Workspace) -> xr.DataTree:
         "team": to_json(asdict(workspace.team)),
         "sight": to_json(workspace.sight and asdict(workspace.sight)),
         "places": to_json(workspace.places),
+        "closed": to_json([*workspace.closed.items()]),
     }
     if robots != workspace.team.names:
         result.attrs["robots"] = to_json(robots)
@@ -89,9 +90,11 @@ def workspace_from_tree(tree: xr.DataTree) -> Workspace:
     maps = cells["awareness"], cells["passable"]
     onward = cells.get("onward")
     places = json.loads(tree.attrs.get("places", "{}"))
+    closed = json.loads(tree.attrs.get("closed", "[]"))
     workspace = Workspace(
         *maps, grid, team, terrain, pixels, composites, posts, onward,
         places={name: tuple(position) for name, position in places.items()},
+        closed={tuple(map(tuple, cells)): reason for cells, reason in closed},
     )  # fmt: skip
     robots = tree.attrs.get("robots")
     return workspace if robots is None else workspace.of_robots(json.loads(robots))

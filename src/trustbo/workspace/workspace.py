@@ -52,6 +52,7 @@ from trustbo.workspace.awareness import (
     unlabelled,
     with_line_of_sight,
 )
+from trustbo.workspace.closed import closed_mask, closed_text, require_closed
 from trustbo.workspace.difficulty import Difficulty
 from trustbo.workspace.grid import MAX_MISSING, Grid, Location
 from trustbo.workspace.line_of_sight import onward_maps
@@ -88,6 +89,8 @@ class Workspace(Fixed, Summary):
         within: Workspace of the whole team if this one is that of some of its robots (see
             `of_robots`); None if it is that of the whole team.
         places: Positions x and y of named places, in CRS metres, by name; see `with_places`.
+        closed: Reason for each closed cell, (cell,), and each closed bound, (cell, cell); see
+            `closing`.
 
     Example:
         >>> terrain = tb.terrain.example()
@@ -106,6 +109,7 @@ class Workspace(Fixed, Summary):
     onward: xr.DataArray | None = None
     within: "Workspace | None" = None
     places: dict[str, tuple[float, float]] = field(default_factory=dict)
+    closed: dict[tuple[Cell, ...], str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._fix()
@@ -299,6 +303,7 @@ class Workspace(Fixed, Summary):
             ("sight", "none assumed" if self.sight is None else str(self.sight)),
             ("terrain", " x ".join(map(str, n_pixels)) + " pixels" if n_pixels else "none"),
             *((f"  {name}", self._place_text(name)) for name in self.places),
+            *([("closed", closed_text(self.closed, self.name_of))] if self.closed else []),
         ]
 
     def _place_text(self, name: str) -> str:
@@ -373,6 +378,46 @@ class Workspace(Fixed, Summary):
         for name, (x, y) in self.places.items():
             found.setdefault(self.grid.locate({"x": x, "y": y}), name)
         return found
+
+    def closing(self, where: Sequence[Any], reason: str = "") -> "Workspace":
+        """Return the workspace with closed cells and bounds, which no path takes.
+
+        No path enters a closed cell, but a team in it can leave it. A closed bound is taken in
+        neither direction. Only paths change: `passable`, posts and routes are those of the ground,
+        and what was learned on it remains valid. Robots of T2 may pass beside a closed cell.
+
+        Args:
+            where: Cells, and bounds as pairs of neighbouring cells. Instead of a cell, a position
+                or the name of a place can be given; see `locate`.
+            reason: Reason for messages, such as "wreck".
+
+        Raises:
+            TrustboError: A cell is off the grid or impassable, or the cells of a bound are not
+                neighbours.
+
+        Example:
+            >>> detour = workspace.closing([(3, 4), ((2, 1), (1, 1))], reason="wreck")
+            >>> plan = tb.Planner(detour, (9, 0), (0, 9)).plan(posterior)
+        """
+        return self.with_closed(self.closed | require_closed(where, reason, self.locate))
+
+    def with_closed(self, closed: dict[tuple[Cell, ...], str]) -> "Workspace":
+        """Return the workspace in which exactly these cells and bounds are closed."""
+        if closed == self.closed:
+            return self
+        if self.within is not None:
+            return self.within.with_closed(closed).of_robots(self.team.names)
+
+        other = dataclasses.replace(self, closed=dict(closed))
+        for name in ("passable_bounds", "difficulty"):  # slow, and the same
+            vars(other)[name] = getattr(self, name)
+        return other
+
+    @property
+    def open_bounds(self) -> np.ndarray:
+        """Whether a path may take each bound, (move, row, col): it is passable and not closed."""
+        bounds: np.ndarray = self.passable_bounds.values
+        return bounds & ~closed_mask(self.closed, bounds.shape) if self.closed else bounds
 
     @property
     def whole(self) -> "Workspace":
