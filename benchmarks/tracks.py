@@ -104,7 +104,7 @@ def outcome(workspace, simulator, course, posterior, sd, seed):
 
 
 def main():
-    given = parsed(arguments(__doc__, n=200, quick="12 logs"))
+    given = parsed(arguments(__doc__, n=200, out="out/tracks", quick="12 logs"))
     n = 12 if given.quick else given.n
 
     workspace = tb.Workspace.from_terrain(
@@ -143,6 +143,7 @@ def main():
         of_group = np.quantile(np.concatenate([errors[i] for i in index]), [*quantiles.values()])
         total = table.loc[index, counts].sum()
         shown.row(name, *map(int, total), *(f"{error:.3f}" for error in of_group))
+    shown.write(given.out / "tracks.csv")
 
 
 if __name__ == "__main__":

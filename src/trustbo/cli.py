@@ -145,20 +145,7 @@ def _add_field_commands(command: Callable[..., Any]) -> None:
         add("--cause", default="", metavar="TEXT", help=text)
 
     example = "--dem dem.tif --dsm dsm.tif --shape 12,10 --max-slope 18 --place camp=9,1"
-    add = on_folder(new, "Begin a campaign of real robots on a ground.", example)
-    add("--dem", type=Path, required=True, metavar="FILE", help="raster of ground heights")
-    add("--dsm", type=Path, metavar="FILE", help="raster of surface heights")
-    _add_workspace(add)
-    add("--names", type=_names, metavar="NAMES", help="names of the robots, such as alpha,bravo")
-    text = f"name of a location, such as camp=9,1; repeat it. {LOCATION}"
-    add("--place", type=_named_place, action="append", metavar="NAME=LOCATION", help=text)
-    text = "how the slope limit is known (default data sheet)"
-    add("--limit", choices=LIMITS, default="data sheet", help=text)
-    text = "sets of posts of each cell (default 3)"
-    text = "TOML file with the names and units of the columns of logs; it is copied"
-    add("--columns", type=Path, metavar="FILE", help=text)
-    add("--posts", type=int, choices=(1, 3), default=3, help=text)
-    add("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
+    _add_ground(on_folder(new, "Begin a campaign of real robots on a ground.", example))
 
     add = on_folder(field.ask, "Plan the next mission.", "camp hill --nav2 nav2")
     add_course(add)
@@ -204,6 +191,23 @@ def _add_closings(on_folder: Callable[..., Any]) -> None:
     add = on_folder(field.reopen, "Reopen what was closed.", example)
     add("closing", type=_count, metavar="N", help="number of the closing, as in status")
     add("--reason", required=True, metavar="TEXT", help="why it is open again")
+
+
+def _add_ground(add: Any) -> None:
+    """Add the flags of a campaign of real robots."""
+    add("--dem", type=Path, required=True, metavar="FILE", help="raster of ground heights")
+    add("--dsm", type=Path, metavar="FILE", help="raster of surface heights")
+    _add_workspace(add)
+    add("--names", type=_names, metavar="NAMES", help="names of the robots, such as alpha,bravo")
+    text = f"name of a location, such as camp=9,1; repeat it. {LOCATION}"
+    add("--place", type=_named_place, action="append", metavar="NAME=LOCATION", help=text)
+    text = "how the slope limit is known (default data sheet)"
+    add("--limit", choices=LIMITS, default="data sheet", help=text)
+    text = "sets of posts of each cell (default 3)"
+    add("--posts", type=int, choices=(1, 3), default=3, help=text)
+    text = "TOML file with the names and units of the columns of logs; it is copied"
+    add("--columns", type=Path, metavar="FILE", help=text)
+    add("--seed", type=int, default=0, metavar="N", help="random seed (default 0)")
 
 
 def _add_campaign(add: Any, folder: str) -> None:
