@@ -198,3 +198,37 @@ def test_labelled_fields_of_parameters_are_read_by_name(truth, workspace):
         one.replace(robots=None, beta=beta)  # the order of arrays without names is unknown
     with pytest.raises(TrustboError, match="slope"):
         one.replace(beta=beta.assign_coords(feature=["slope", "canopy"]))
+
+
+SOME_DRAWS = {
+    "first half dropped": (slice(12, None), "posterior"),
+    "every second one": (slice(None, None, 2), "posterior"),
+    "last ones dropped": (slice(0, 20), "places"),
+    "one draw": ([7], "posterior"),
+    "dropped and reversed": (slice(20, 5, -1), "places"),
+}
+
+
+@pytest.mark.parametrize(("draws", "group"), SOME_DRAWS.values(), ids=SOME_DRAWS)
+def test_draws_of_groups_are_matched_by_their_labels(missions, workspace, draws, group):
+    posterior = tb.fit(missions, workspace=workspace, draws=25, **QUIET)
+    planner = tb.Planner(workspace, (4, 0), (0, 4))
+    joined = ["posterior", "places", "robots"]
+
+    def trust(groups):
+        some = posterior.copy()
+        for name in groups:
+            some[name] = xr.DataTree(posterior[name].to_dataset().isel(draw=draws))
+        return planner.trust(some, "r2", (2, 2)).mean().item()
+
+    assert trust([group]) == pytest.approx(trust(joined), abs=1e-12)
+
+
+@pytest.mark.parametrize("label", [lambda k: k + 1000, lambda k: 0, lambda k: k + 0.5])
+def test_groups_without_common_draws_are_refused(missions, workspace, label):
+    posterior = tb.fit(missions, workspace=workspace, draws=25, **QUIET)
+    other = posterior["posterior"].to_dataset()
+    other = other.assign_coords(draw=[label(k) for k in range(other.sizes["draw"])])
+    posterior["posterior"] = xr.DataTree(other)
+    with pytest.raises(TrustboError, match="draw"):
+        params_of(posterior, workspace)

@@ -11,7 +11,7 @@ import xarray as xr
 
 from trustbo.arrays import in_order, joined_draws
 from trustbo.data import Mission, sight_columns
-from trustbo.errors import TrustboError, require_count, require_kind, require_whole
+from trustbo.errors import TrustboError, one_line, require_count, require_kind, require_whole
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.functions.data import require_same_order
 from trustbo.inference.functions.known import is_of_function
@@ -355,8 +355,10 @@ def _in_order(
             names[f"{axis}_"] = of_axis  # second axis of a matrix, or of means over robots
 
     given = {name: group.to_dataset() for name, group in posterior.children.items()}
+    joined = ["posterior", *(effect.group for effect in effects_of(posterior))]
+    matched = given | _of_common_draws({name: given[name] for name in joined if name in given})
     groups = {}
-    for name, group in given.items():
+    for name, group in matched.items():
         ordered = in_order("the posterior", group, names)
         if name == "places":
             ordered = in_order_of_places(ordered)
@@ -373,6 +375,32 @@ def _in_order(
     whole = xr.DataTree.from_dict(groups)
     whole.attrs = posterior.attrs | {"robots": list(robots), "features": list(features)}
     return whole
+
+
+def _of_common_draws(groups: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
+    """Return groups with the draws that all of them have, by the labels of chains and draws.
+
+    Users drop the first draws of a chain, or keep every second one, in one group only.
+    """
+    for axis in ("chain", "draw"):
+        found = {name: group[axis].values for name, group in groups.items() if axis in group.dims}
+        first = found.get("posterior", np.empty(0))
+        if all(np.array_equal(labels, first) for labels in found.values()):
+            continue
+
+        common = set(first.tolist()).intersection(*(set(one.tolist()) for one in found.values()))
+        if not common or any(len(set(one.tolist())) < len(one) for one in found.values()):
+            raise TrustboError(
+                f"the groups {', '.join(found)} of the posterior have other labels of {axis}s, "
+                f"{one_line([one.tolist() for one in found.values()])}; select the same draws in "
+                "all groups, as with posterior.isel(draw=slice(500, None))."
+            )
+        kept = sorted(common)
+        groups = {
+            name: group.sel({axis: kept}) if name in found else group
+            for name, group in groups.items()
+        }
+    return groups
 
 
 def _names_along(
