@@ -18,7 +18,10 @@ def __getattr__(name: str) -> object:
         return version("trustbo")
 
     from trustbo.display import announced
+    from trustbo.errors import require_docstrings
 
+    if not name.endswith("Error"):  # so that users can catch it
+        require_docstrings()
     with announced(f"Loading libraries for trustbo.{name} (a few seconds)."):
         found = _getattr(name)
     globals()[name] = found  # the next use of the name does not come here

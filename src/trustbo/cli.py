@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from trustbo import field_commands as field
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_docstrings
 
 if TYPE_CHECKING:
     from trustbo.campaign.result import Result
@@ -46,11 +46,12 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         arguments: Words after `trustbo`; by default those of this process.
     """
     args = parser().parse_args(arguments)
-    warnings.showwarning = lambda message, *_, **__: print(f"warning: {message}", file=sys.stderr)
+    warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
     for stream in (sys.stdout, sys.stderr):  # a terminal may not support all characters
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
+        require_docstrings()
         args.run(args)
     except KeyboardInterrupt:
         folder = getattr(args, "folder", None) or getattr(args, "out", ".")
@@ -63,8 +64,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _exit(message: str, code: int) -> NoReturn:
-    print(message, file=sys.stderr)
+    _say(message)
     sys.exit(code)
+
+
+def _say(message: str) -> None:
+    """Print a line to stderr; nothing without a stderr, as `print` would use stdout."""
+    if sys.stderr is not None:
+        print(message, file=sys.stderr)
 
 
 def parser() -> argparse.ArgumentParser:

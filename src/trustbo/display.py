@@ -1,5 +1,6 @@
 """Display of objects and progress, as text in a terminal and as HTML in a notebook."""
 
+import io
 import sys
 import textwrap
 import threading
@@ -78,7 +79,9 @@ def slow_bar(name: str, unit: str, shown: bool, *, total: int | None = None) -> 
 
 def bar(shown: bool, **options: Any) -> tqdm:
     """Make a progress bar, unless nobody sees it; see `shows_bars`."""
-    return tqdm(disable=not (shown and shows_bars()), **options)
+    # tqdm reads sys.stderr also for a bar that it does not show.
+    file = sys.stderr if _has_stderr() else io.StringIO()
+    return tqdm(disable=not (shown and shows_bars()), file=file, **options)
 
 
 def shows_bars() -> bool:
@@ -86,7 +89,12 @@ def shows_bars() -> bool:
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython else None
     is_notebook = type(shell).__name__ == "ZMQInteractiveShell"
-    return is_notebook or sys.stderr.isatty()
+    return is_notebook or (_has_stderr() and sys.stderr.isatty())
+
+
+def _has_stderr() -> bool:
+    """Return whether there is a standard error; services and `2>&-` have none, or a closed one."""
+    return sys.stderr is not None and not getattr(sys.stderr, "closed", False)
 
 
 @contextmanager
@@ -133,5 +141,7 @@ def say_once(text: str) -> None:
 
 
 def say(text: str) -> None:
-    """Print a line to stderr, above any progress bar."""
+    """Print a line to stderr, above any progress bar; nothing without a stderr."""
+    if not _has_stderr():
+        return
     tqdm.write(text, file=sys.stderr)

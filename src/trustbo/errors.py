@@ -3,6 +3,7 @@
 import contextlib
 import math
 import operator
+import sys
 import unicodedata
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -51,6 +52,15 @@ class PosteriorError(TrustboError):
 def warn(message: str) -> None:
     """Issue a UserWarning that points at the line outside of trustbo that made the call."""
     warnings.warn(message, stacklevel=2, skip_file_prefixes=_NOT_CALLERS)
+
+
+def require_docstrings() -> None:
+    """Raise TrustboError under `python -OO`, where libraries fail that append to docstrings."""
+    if sys.flags.optimize >= 2:
+        raise TrustboError(
+            "ArviZ, which trustbo needs, does not run under python -OO (PYTHONOPTIMIZE=2), which "
+            "removes docstrings; use -O, or neither."
+        )
 
 
 def require_choice(what: str, value: object, choices: Iterable[str]) -> str:

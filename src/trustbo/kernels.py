@@ -29,7 +29,8 @@ def kernel(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiled(function: Callable[..., Any]) -> Any:
         made = njit(nogil=True, error_model="numpy", **options)(function)
-        _store(made)
+        if not _CONFIG.DISABLE_JIT:  # with NUMBA_DISABLE_JIT=1, Python runs the function, slowly
+            _store(made)
         return made
 
     return compiled

@@ -24,6 +24,7 @@ from jax.experimental.compilation_cache import compilation_cache
 from scipy import special
 
 from trustbo.compiled import folder_of
+from trustbo.errors import TrustboError
 from trustbo.forks import require_threads_of_jax
 
 with warnings.catch_warnings():
@@ -135,14 +136,44 @@ def own_settings() -> Iterator[None]:
 def own_flags() -> Iterator[None]:
     """Use float64 and the threefry generator, regardless of the caller's JAX flags.
 
+    Nor do flags apply with which users look for errors in their own programs: our programs contain
+    NaN and infinities that are masked later, as do those of NumPyro.
+
     This alone is enough to make a distribution that computes nothing, such as a normal one.
     """
     with (
+        _naming_the_device(),
         jax.enable_x64(True),
         jax.default_prng_impl("threefry2x32"),
+        jax.enable_custom_prng(False),
+        jax.debug_nans(False),
+        jax.debug_infs(False),
+        jax.disable_jit(False),
+        jax.check_tracer_leaks(False),
+        jax.debug_key_reuse(False),
         jax.threefry_partitionable(True),
         jax.numpy_rank_promotion("allow"),
         jax.numpy_dtype_promotion("standard"),
         jax.transfer_guard("allow"),
     ):
         yield
+
+
+@contextmanager
+def _naming_the_device() -> Iterator[None]:
+    """Raise a TrustboError with JAX's reason if the block fails because JAX has no device.
+
+    JAX is asked only after an error, as the question starts its threads.
+    """
+    try:
+        yield
+    except (RuntimeError, AssertionError):
+        try:
+            jax.devices()
+        except (RuntimeError, AssertionError) as error:
+            reason = " ".join(str(error).split()) or "no platform could be initialised"
+            raise TrustboError(
+                f"JAX has no device for jax_platforms={jax.config.jax_platforms!r}: "
+                f"{reason.rstrip('.')}. Unset JAX_PLATFORMS, or set JAX_PLATFORMS=cpu."
+            ) from error
+        raise
