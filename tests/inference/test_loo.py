@@ -100,7 +100,7 @@ def test_the_limit_of_k_hat_falls_with_few_draws():
     ]
 
 
-def test_a_mission_whose_weights_fail_is_left_out_of_a_refit(monkeypatch):
+def test_a_mission_whose_weights_fail_is_left_out_of_a_refit(monkeypatch, capsys):
     """With a limit that no weights meet, every mission is; the densities are the same."""
     missions = simulate_missions(5, lengths=(8,))
     posterior = fit(missions, PooledTrust(), progress=False)
@@ -108,7 +108,11 @@ def test_a_mission_whose_weights_fail_is_left_out_of_a_refit(monkeypatch):
     # The package's `loo` is the function.
     module = importlib.import_module("trustbo.inference.loo")
     monkeypatch.setattr(module, "good_khat", lambda n_effective: -10.0)
+    monkeypatch.setattr(module, "_LONG", 0.0)
     by_refits = loo(posterior)
+    assert "4 more missions" in capsys.readouterr().err  # no bar tells the time here
+    loo(posterior, progress=False)
+    assert capsys.readouterr().err == ""
     assert by_refits.elpd_i["refitted"].values.all()
     np.testing.assert_allclose(by_refits.elpd_i, by_weights.elpd_i, atol=0.35)
 

@@ -12,6 +12,7 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
+import rasterio.rpc
 import rasterio.warp
 import rioxarray
 import xarray as xr
@@ -443,6 +444,21 @@ def test_rasters_without_a_place_are_refused(tmp_path):
         read_terrain(placed)
     with pytest.raises(TrustboError, match="coordinates"):
         read_terrain(array(plane()).drop_vars(["x", "y"]))
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_corners_are_no_remedy_for_rasters_of_a_camera(tmp_path):
+    unit = [0.0, 0.0, 1.0, *[0.0] * 17]
+    one = [1.0, *[0.0] * 19]
+    rpcs = rasterio.rpc.RPC(
+        height_off=100.0, height_scale=500.0, lat_off=45.0, lat_scale=0.1, line_den_coeff=one,
+        line_num_coeff=unit, line_off=4.0, line_scale=4.0, long_off=15.0, long_scale=0.1,
+        samp_den_coeff=one, samp_num_coeff=unit, samp_off=5.0, samp_scale=5.0,
+    )  # fmt: skip
+    raster = write(tmp_path / "rpcs.tif", plane(), crs=None, transform=None, rpcs=rpcs)
+    with pytest.raises(TrustboError, match="RPC_DEM") as refused:
+        read_terrain(raster)
+    assert "a_ullr" not in str(refused.value)
 
 
 @EQUAL_CANOPY

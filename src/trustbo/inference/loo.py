@@ -14,6 +14,7 @@ without mission j.
 """
 
 import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -28,7 +29,7 @@ from tqdm import tqdm
 
 from trustbo.arrays import evenly_spaced, in_order
 from trustbo.data import Mission
-from trustbo.display import slow_bar
+from trustbo.display import say, shows_bars, slow_bar
 from trustbo.errors import PosteriorError, TrustboError, require_switch, warn
 from trustbo.inference.density import at
 from trustbo.inference.fit import fit
@@ -49,6 +50,8 @@ _FEWEST = 4
 optimistic."""
 _FEWEST_OF_CLASS = 10
 """The same number for model classes, whose refits take about a second."""
+_LONG = 20.0
+"""Seconds of refits from which their duration is announced."""
 _LEAST_EFFECTIVE = 2.0
 """Smallest effective number of draws that is used to compute the limit of k-hat."""
 
@@ -139,7 +142,10 @@ def estimated(
 
         fewest = _FEWEST_OF_CLASS if isinstance(model, TrustModel) else _FEWEST
         is_refitted = ~(k_hat.values <= limit) | (n_missions < fewest)
-        for i in np.flatnonzero(is_refitted):
+        began = time.monotonic()
+        for k, i in enumerate(np.flatnonzero(is_refitted)):
+            if k == 1 and progress and not shows_bars():
+                _announce_refits(int(is_refitted.sum()) - 1, time.monotonic() - began)
             if model is None:
                 raise TrustboError(_no_refit(labels[i], float(k_hat[i]), limit, n_missions))
             bar.set_description_str(f"loo, refit without mission {labels[i]}")
@@ -171,6 +177,14 @@ def estimated(
         elpd_i=xr.DataArray(density.values, coords, "mission", attrs=attrs),
         pareto_k=xr.DataArray(k_hat.values, coords, "mission"),
     )
+
+
+def _announce_refits(n_left: int, seconds: float) -> None:
+    """Print how long refits will take, where no bar tells it, if this is more than a moment."""
+    left = n_left * seconds
+    if left > _LONG:
+        minutes = f"{left / 60.0:.0f} min" if left > 90.0 else f"{left:.0f} s"
+        say(f"loo: {n_left} more missions must be left out by refits, about {minutes}.")
 
 
 def _by_mission(
