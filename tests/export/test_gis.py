@@ -165,8 +165,12 @@ def test_places_in_geojson_are_those_of_the_plan(result, tmp_path):
     assert len(layers["bounds"]) == len(plan.path)
     line = np.array(layers["path"][0]["geometry"]["coordinates"])
     x, y = transform("EPSG:4326", crs, *line.T.tolist())
-    centres = [result.workspace.grid.center(cell) for cell in plan.path]
-    np.testing.assert_allclose(np.transpose([x, y]), centres, atol=0.01)
+    stops = np.array([result.workspace.posts.stop(cell) for cell in plan.path])
+    np.testing.assert_allclose(np.transpose([x, y]), stops, atol=0.01)
+    at_bounds = [one["geometry"]["coordinates"] for one in layers["bounds"]]
+    np.testing.assert_array_equal(at_bounds, line)
+    length = np.hypot(*np.diff(stops, axis=0).T).sum()
+    assert layers["path"][0]["properties"]["length_m"] == pytest.approx(length)
     last = layers["bounds"][-1]["properties"]
     assert last["cell"] == [*plan.path[-1]]
     assert last["trust_r1"] == plan.trust[-1, 0]
@@ -185,6 +189,31 @@ def test_driven_bounds_are_marked_in_geojson(result, tmp_path):
         of_layer = [one for one in about if one["layer"] == layer and one["bound"] > 0]
         assert all(one["driven"] == (one["bound"] == 1) for one in of_layer)
         assert len({one["driven"] for one in of_layer}) == 2
+
+
+def features_in(file):
+    return json.loads(file.read_text())["features"]
+
+
+def test_layers_in_files_of_their_own_are_those_of_one_file(result, tmp_path):
+    plan = result.plan()
+    ground = plan.workspace.closing([(0, 1), ((1, 1), (2, 1))], "mud")
+    plan = dataclasses.replace(plan, workspace=ground.with_places({"camp": plan.start}))
+    write_geojson(tmp_path / "all.geojson", plan)
+    write_geojson(tmp_path / "field", plan)
+    every = json.loads((tmp_path / "all.geojson").read_text())["features"]
+    found = {file.stem: features_in(file) for file in (tmp_path / "field").iterdir()}
+    assert sorted(found) == ["bounds", "closed", "path", "places", "posts", "routes"]
+    for layer, features in found.items():
+        assert features == [one for one in every if one["properties"]["layer"] == layer]
+    cell, bound = found["closed"]
+    assert (cell["geometry"]["type"], bound["geometry"]["type"]) == ("Point", "LineString")
+    assert bound["properties"] == {"layer": "closed", "reason": "mud", "cells": [[1, 1], [2, 1]]}
+    x, y = transform("EPSG:4326", ground.grid.crs, *np.transpose([cell["geometry"]["coordinates"]]))
+    np.testing.assert_allclose(np.ravel([x, y]), ground.grid.center((0, 1)), atol=0.01)
+
+    write_geojson(tmp_path / "field", result.plan())  # without closings: none is left over
+    assert features_in(tmp_path / "field" / "closed.geojson") == []
 
 
 @pytest.mark.parametrize("west", [-180.5, 179.5])

@@ -36,6 +36,7 @@ def result():
 
 FIGURES = {
     "trust_maps": (lambda r, ax: r.plot_maps(ax=ax), 3),
+    "trust_maps of a robot": (lambda r, ax: r.plot_maps("r2", ax=ax), 2),
     "terrain_maps": (lambda r, ax: plots.terrain_maps(r.workspace, ax=ax), 4),
     "cell_map": (lambda r, ax: plots.cell_map(r.trust_map, r.workspace, path=r.path, ax=ax), 1),
     "plan_map": (lambda r, ax: plots.plan_map(r.plan(), bounds=[1], ax=ax), 2),
@@ -560,3 +561,31 @@ def test_the_colour_of_a_cell_is_that_of_its_value_in_every_style(style):
         np.testing.assert_allclose(
             colour, mpl.colormaps["viridis"](values[cell], bytes=True), atol=1
         )
+
+
+def test_the_map_of_a_robot_shows_its_trust_and_its_sd_where_nobody_went(result):
+    mean, sd = result.plot_maps("r2")
+    of_robot = result.robot_maps().sel(robot="r2")
+    free = result.workspace.passable.values
+    for ax, name in ((mean, "trust_mean"), (sd, "trust_sd")):
+        shown = np.ma.filled(ax.images[0].get_array().astype(float), np.nan)
+        np.testing.assert_array_equal(shown, np.where(free, of_robot[name].values, np.nan))
+        [hatched] = [one for one in ax.collections if one.get_hatch()]
+        new = free.copy()
+        for mission in result.missions:
+            for bound in mission.bounds:
+                new[bound.cell] = False
+        assert np.sum(~np.ma.getmaskarray(hatched.get_array())) == new.sum()
+    assert mean.get_title().startswith("r2")
+    with pytest.raises(tb.TrustboError, match="robot"):
+        result.plot_maps("r9")
+
+
+def test_what_is_closed_is_crossed_in_maps(result):
+    ground = result.workspace.closing([(1, 1), ((2, 1), (2, 2))], "mud")
+    ax = plots.cell_map(result.trust_map, ground)
+    crosses = [line.get_xydata()[0] for line in ax.lines if line.get_marker() == "x"]
+    grid = ground.grid
+    middle = np.mean([grid.center((2, 1)), grid.center((2, 2))], 0)
+    expected = np.array([grid.center((1, 1)), middle]) - grid.corner
+    np.testing.assert_allclose(crosses, expected)

@@ -20,7 +20,7 @@ from trustbo.campaign.settings import to_planner
 from trustbo.campaign.state import EARLIER, State
 from trustbo.data import NOWHERE, POST_SETS, Cell, Mission, path_text
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_kind, require_switch
+from trustbo.errors import TrustboError, require_choice, require_kind, require_switch
 from trustbo.files import FilePath
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference.learner import Learner
@@ -712,12 +712,32 @@ class Result(Summary):
             ahead = self._ahead
         return maps_of(self.planner.problem, ahead, n_draws, 0, expected=expected)
 
-    def plot_maps(self, **options: Any) -> np.ndarray:
-        """Plot trust maps and paths of four missions; see `plots.trust_maps` for the options."""
+    def plot_maps(self, robot: str | None = None, **options: Any) -> np.ndarray:
+        """Plot trust maps and paths of four missions, or the last map of a robot with its sd.
+
+        Cells that no mission entered are hatched, and what is closed is crossed.
+
+        Args:
+            robot: Name of a robot. The figure then shows the mean and the standard deviation of the
+                trust in this robot, as in `robot_maps`, side by side.
+            **options: Options of `plots.trust_maps`.
+
+        Example:
+            >>> result.plot_maps("r2")[0].figure.savefig("r2.png")
+        """
         from trustbo import plots  # imports matplotlib
 
         options = {"driven": self._driven, **options}
-        return plots.trust_maps(self.history, self.trust_map, self.path, self.workspace, **options)
+        if robot is None:
+            trust = self.trust_map
+        else:
+            require_choice("robot", robot, self.workspace.team.names)
+            maps = self.robot_maps().sel(robot=robot)
+            trust = maps["trust_mean"]
+            options = {"missions": [], "sd": maps["trust_sd"], **options}
+        plan = self.plan()
+        ground = self.workspace.with_closed(plan.workspace.whole.closed)
+        return plots.trust_maps(self.history, trust, plan.path, ground, **options)
 
     @property
     def _driven(self) -> np.ndarray:

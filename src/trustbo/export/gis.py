@@ -1,6 +1,7 @@
 """Files for GIS: maps as GeoTIFF, plans as GeoJSON, and missions as CSV."""
 
 import json
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from trustbo.terrain.place import converted
 from trustbo.workspace.moves import cells_along, posts_along
 
 _NO_CRS = "this export needs a CRS; make the workspace with Workspace.from_terrain."
+LAYERS = ("path", "bounds", "places", "closed", "posts", "routes")
+"""Layers of a plan in GeoJSON."""
 _TIFF = (".tif", ".tiff")
 """Suffixes of a GeoTIFF."""
 
@@ -85,15 +88,17 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     For a result or a campaign, this is the recommended path, the best one under the posterior mean.
     To write the next path of a campaign, which may differ, pass `campaign.ask()`.
 
-    The file contains a LineString of the path and a Point for each cell. The properties of a cell
-    are the trust of each robot with its 90 % interval, and the failure probability. With a terrain,
-    there is also a Point for each post and a LineString for each route. The property `layer` is
-    "path", "bounds", "places" (with names), "posts" or "routes". Bounds, posts and routes have the
-    property `driven`: true if the bound had been driven when the mission was replanned. Lines are
-    cut where they cross the 180th meridian.
+    The file contains a LineString of the path through the lead's stops and a Point for each stop
+    or, without a terrain, for the centre of each cell. The properties of a stop are the trust of
+    each robot with its 90 % interval, and the failure probability. With a terrain, there is also a
+    Point for each post and a LineString for each route. The property `layer` is "path", "bounds",
+    "places" (with names), "closed" (with reasons), "posts" or "routes". Bounds, posts and routes
+    have the property `driven`: true if the bound had been driven when the mission was replanned.
+    Lines are cut where they cross the 180th meridian.
 
     Args:
-        path: File to write or replace.
+        path: File to write or replace. A path without an ending, such as "field", is a folder with
+            a file for each layer, "field/path.geojson", so that a GIS can give each a style.
         plan: Plan, such as one from `Campaign.ask`, `Campaign.replan` or `Follower.replan`; or a
             result or campaign, whose recommended path is written.
 
@@ -108,38 +113,61 @@ def write_geojson(path: FilePath, plan: Plan | Result) -> None:
     require_kind("plan", plan, Plan, "give a Plan, for example from Campaign.ask, or a Result")
     facts = {"name": name, "n_bounds": len(plan.path) - 1, "n_driven": plan.n_driven}
     facts |= {"value": float(plan.value), "objective": plan.objective}
-    features = [_feature(plan, "path", plan.positions, facts | {"length_m": float(plan.length)})]
+    stops = plan.positions if plan.stops is None else plan.stops
+    facts |= {"length_m": shapely.LineString(stops).length}
+    features = [_feature(plan, "path", stops, facts)]
 
     rows = plan.to_frame().loc[:, "driven":].to_dict("records")
     cells = cells_along(plan.path).tolist()
-    for k, (cell, place, row) in enumerate(zip(cells, plan.positions, rows, strict=True)):
+    for k, (cell, place, row) in enumerate(zip(cells, stops, rows, strict=True)):
         known = {name: value for name, value in row.items() if pd.notna(value)}
         features.append(_feature(plan, "bounds", place, {"bound": k, **known, "cell": cell}))
 
+    features += [*_of_ground(plan), *_of_robots(plan)]
+    target = to_path(path)
+    files = {target: features}
+    if not target.suffix:
+        files = {target / f"{layer}.geojson": [] for layer in LAYERS}
+        for one in features:
+            files[target / f"{one['properties']['layer']}.geojson"].append(one)
+    for file, of_file in files.items():
+        write_text(file, json.dumps({"type": "FeatureCollection", "features": of_file}))
+
+
+def _of_ground(plan: Plan) -> Iterator[dict[str, Any]]:
+    """Yield the features of places, and of closed cells and bounds."""
     workspace = plan.workspace
     for place, position in workspace.places.items():
         about = {"name": place, "cell": workspace.locate(place)}
         if workspace.posts is not None:
             about["from_stop_m"] = workspace.from_stop(place)
-        features.append(_feature(plan, "places", np.array(position), about))
+        yield _feature(plan, "places", np.array(position), about)
 
-    team = workspace.team
+    for closed, reason in workspace.closed.items():
+        row, col = np.array(closed).T
+        shape = np.stack([workspace.grid.x[col], workspace.grid.y[row]], 1)
+        about = {"reason": reason, "cells": [list(cell) for cell in closed]}
+        yield _feature(plan, "closed", shape if len(shape) > 1 else shape[0], about)
+
+
+def _of_robots(plan: Plan) -> Iterator[dict[str, Any]]:
+    """Yield the features of posts and routes; there are none without a terrain."""
+    team = plan.workspace.team
+    cells = cells_along(plan.path).tolist()
     sets = posts_along(plan.stations)
     for k, (cell, places) in enumerate(zip(cells, _of(plan.posts), strict=False), start=1):
         for robot, place in zip(team.names, places, strict=True):
             about = {"bound": k, "robot": robot, "driven": k <= plan.n_driven, "cell": cell}
             if plan.workspace.n_posts > 1:
                 about["posts"] = POST_SETS[sets[k - 1]]
-            features.append(_feature(plan, "posts", place, about))
+            yield _feature(plan, "posts", place, about)
 
     for k, routes in enumerate(_of(plan.routes), start=1):
         for robot, route in zip(team.members, routes, strict=True):
             if route is not None:
                 about = {"bound": k, "robot": robot, "driven": k <= plan.n_driven}
                 about |= {"length_m": shapely.LineString(route).length}
-                features.append(_feature(plan, "routes", route, about))
-
-    write_text(path, json.dumps({"type": "FeatureCollection", "features": features}))
+                yield _feature(plan, "routes", route, about)
 
 
 def write_csv(path: FilePath, result: Result) -> None:

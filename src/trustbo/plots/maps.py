@@ -84,6 +84,8 @@ _TICKED = 0.25
 """Distance between ticks at rows and columns, in inches, at least."""
 _HEIGHTS = (2.0, 11.0)
 """Least and largest height of a new figure of the grid, in inches."""
+CLOSED = ROBOTS[1]
+"""Colour of the marks of closed cells and bounds."""
 COLOURS_OF_SETS = ("white", ROBOTS[5], ROBOTS[4])
 """Colours of the bounds of a path, by the set of posts from which T2 watches them."""
 
@@ -97,6 +99,7 @@ def trust_maps(
     *,
     missions: Sequence[int] | None = None,
     driven: np.ndarray | None = None,
+    sd: xr.DataArray | None = None,
     ax: Any = None,
 ) -> np.ndarray:
     """Plot the trust maps used to plan missions, and the planned paths (Fig. 5 of the paper).
@@ -108,12 +111,14 @@ def trust_maps(
 
     Args:
         history: Trust map and path of each mission, such as `Result.history`.
-        trust_map: Map after the last mission, dims (row, col), such as `Result.trust_map`.
+        trust_map: Map after the last mission, dims (row, col), such as `Result.trust_map`, or of
+            one robot, such as `Result.robot_maps()["trust_mean"].sel(robot="r2")`.
         path: Path recommended after the last mission, such as `Result.path`.
         workspace: Workspace of the cells.
         missions: Numbers of missions, from 1; by default those of 1, 2 and 4 that were run.
         driven: Whether each cell had been entered before each mission and after the last one, shape
             (mission + 1, row, col). Other cells are hatched, because their trust is only predicted.
+        sd: Map of the standard deviation of `trust_map`, which gets a panel beside it.
         ax: Axes to draw on, one for each panel; by default a new figure with a legend.
 
     Returns:
@@ -134,11 +139,7 @@ def trust_maps(
     numbers = history["iteration"].values
     n_missions = max(0, int(numbers.max()))  # earlier missions have negative numbers
     n_earlier = int((numbers < 0).sum())
-    if missions is None:
-        chosen = [i for i in MOMENTS if i <= n_missions]
-    else:
-        given = require_list("missions", missions, remedy="give numbers of missions, such as [1]")
-        chosen = [require_whole("mission", i, 1, n_missions) for i in given]
+    chosen = _moments(missions, n_missions)
 
     planned = history.transpose("iteration", ...).sel(iteration=chosen)
     maps = np.stack(
@@ -147,32 +148,55 @@ def trust_maps(
     paths = [*(path_in(planned.isel(iteration=i)) for i in range(len(chosen))), recommended]
     learned = [*(i - 1 for i in chosen), n_missions]
 
-    for values, cells in zip(maps, paths, strict=True):
-        values[cells[0][:2]] = np.nan  # trust at the start is assumed
+    of_robot = str(trust_map["robot"].item()) if "robot" in trust_map.coords else ""
+    for k, (values, cells) in enumerate(zip(maps, paths, strict=True)):
+        if k < len(chosen) or not of_robot:
+            values[cells[0][:2]] = np.nan  # trust at the start is assumed
     has_learned = np.array(learned) + n_earlier > 0
     norm = Normalize(*limits_of(maps[has_learned], is_trust=True))
 
-    axes = map_panels(workspace.grid, len(maps), ax)
-    for panel, values, cells, n in zip(axes, maps, paths, learned, strict=True):
-        draw_cells(panel, values, workspace, norm, BRIGHT_HIGH)
+    def draw(panel: Axes, values: np.ndarray, norm: Normalize, cmap: str, k: int) -> Any:
+        image = draw_cells(panel, values, workspace, norm, cmap)
         if driven is not None:
-            hatch_undriven(panel, np.asarray(driven)[n], workspace)
-        draw_path(panel, cells, workspace.grid)
+            hatch_undriven(panel, np.asarray(driven)[learned[k]], workspace)
+        draw_path(panel, paths[k], workspace.grid)
+        return image
+
+    axes = map_panels(workspace.grid, len(maps) + (sd is not None), ax)
+    of_trust = axes[: len(maps)]
+    for k, (panel, values, n) in enumerate(zip(of_trust, maps, learned, strict=True)):
+        draw(panel, values, norm, BRIGHT_HIGH, k)
 
         # In two lines if the panel is narrow.
         words = ("before", "mission 1") if n == 0 else ("after", f"mission {n}")
         if n_missions == 0:
             words = ("after", "earlier missions")
-        panel.set_title((" " if is_broad(panel) else "\n").join(words))
+        title = (" " if is_broad(panel) else "\n").join(words)
+        panel.set_title(f"{of_robot}\n{title}" if of_robot and k == len(chosen) else title)
 
-    _trust_bar(axes, ScalarMappable(norm), maps, "expected trust", explain=True)
+    _trust_bar(of_trust, ScalarMappable(norm), maps, "expected trust", explain=True)
+    if sd is not None:
+        known = shown_values(sd, workspace)
+        known[np.isnan(maps[-1])] = np.nan
+        image = draw(axes[-1], known, Normalize(*limits_of(known, is_trust=False)), BRIGHT_LOW, -1)
+        axes[-1].set_title(f"{of_robot}\nuncertainty".lstrip())
+        colour_bar(axes[-1:], image, "standard deviation", known)
     if ax is None:
         drawn = {handle.get_label(): handle for panel in axes for handle in handles_of(panel)}
-        handles = [*drawn.values(), Patch(facecolor=GREY, label="impassable or start")]
+        grey = "impassable" if of_robot and not chosen else "impassable or start"
+        handles = [*drawn.values(), Patch(facecolor=GREY, label=grey)]
         if driven is not None:
             handles.append(Patch(facecolor="0.9", label="never entered", **_HATCH))
         add_legend(axes, handles)
     return axes
+
+
+def _moments(missions: Sequence[int] | None, n_missions: int) -> list[int]:
+    """Return the numbers of the missions to show."""
+    if missions is None:
+        return [i for i in MOMENTS if i <= n_missions]
+    given = require_list("missions", missions, remedy="give numbers of missions, such as [1]")
+    return [require_whole("mission", i, 1, n_missions) for i in given]
 
 
 @styled
@@ -478,13 +502,16 @@ def draw_cells(
 
 
 def draw_places(ax: Axes, workspace: Workspace) -> None:
-    """Mark the named places of a workspace."""
+    """Mark the named places of a workspace, and the middle of what is closed."""
+    for cells in workspace.closed:
+        x, y = positions_of(cells, workspace.grid).mean(0)
+        (cross,) = ax.plot(x, y, "x", color=CLOSED, markersize=6, mew=1.8, zorder=6, label="closed")
+        cross.set_path_effects(outlined(3.2, "white"))
     for name, position in workspace.places.items():
         x, y = np.array(position) - workspace.grid.corner
         ax.plot(x, y, "+", color="black", markersize=7, zorder=6)
-        text = ax.annotate(
-            name, (x, y), (4, 4), textcoords="offset points", fontsize="small", zorder=6
-        )
+        style: dict[str, Any] = {"color": "black", "fontsize": "small", "zorder": 6}
+        text = ax.annotate(name, (x, y), (4, 4), textcoords="offset points", **style)
         text.set_path_effects(outlined(2.0, "white"))
 
 
