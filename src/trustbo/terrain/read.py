@@ -276,8 +276,8 @@ def _of_file(file: DatasetReader, role: str, name: str) -> xr.DataArray:
     turned = shear_x > _ROUNDING * abs(t.a) or shear_y > _ROUNDING * abs(t.e)
     if t.is_identity and file.rpcs is not None:
         raise TrustboError(
-            f"{name} is placed only by the coefficients of its camera (RPCs), which need heights of "
-            "the ground; warp it to a map, e.g. with gdalwarp -rpc -to RPC_DEM=ground.tif "
+            f"{name} is placed only by the coefficients of its camera (RPCs), which need heights "
+            "of the ground; warp it to a map, e.g. with gdalwarp -rpc -to RPC_DEM=ground.tif "
             "-t_srs EPSG:32633. Declared corners would put it elsewhere."
         )
     if t.is_identity or turned:
