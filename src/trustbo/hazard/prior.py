@@ -1,5 +1,6 @@
 """Prior on the probability that a bound fails, as a function of normal scores."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -10,7 +11,11 @@ from scipy import special
 from scipy.interpolate import PchipInterpolator
 
 from trustbo.errors import TrustboError, require_choice, require_positive, require_tuple
+from trustbo.kernels import kernel
+from trustbo.parallel import plain
 from trustbo.workspace.difficulty import TILT
+
+_compiled = kernel()
 
 REFERENCE = 0.5
 """Difficulty at which the intercept is the logit of the prior mean."""
@@ -20,6 +25,10 @@ FLOOR = 1e-12
 """Smallest alpha and beta of a Beta prior, because the prior mean may round to 0 or 1."""
 _LARGEST_LOG = 50.0
 """Largest absolute value of the log width and the log strength."""
+_FAR_BELOW = -80.0
+"""Number of widths below the slope limit, negative, at which it stops no robot: 1e-35."""
+_NOTICED = 1e-18
+"""Failure probability that such a limit does not change, because of rounding."""
 _FARTHEST = 40.0
 """Largest tabulated quantile of the margin, in sds of the wider normal."""
 _N_TABULATED = 4000
@@ -152,7 +161,6 @@ class BoundPrior(NamedTuple):
         return prior_betas(*self.values(z), self.difficulty, self.steepness)
 
 
-@np.errstate(under="ignore")  # small weights and tails round to 0
 def prior_betas(
     weights: np.ndarray,
     limit: np.ndarray,
@@ -166,19 +174,31 @@ def prior_betas(
     1 - m is the product of sigma(-logit) and sigma(-(steepness + margin) / width).
     """
     logit = weights[:, :1] + weights[:, 1:] @ difficulty.T
-    fails = special.expit(logit)
-    passes = 1.0 - fails  # rounds to 0 below 1e-16, where FLOOR applies anyway
+    if steepness is None:
+        steepness = np.full(len(difficulty), -np.inf)  # never too steep
+        limit = np.ones((len(logit), 2))
+    return _betas(logit, plain(steepness), plain(limit), plain(strength))
 
-    if steepness is not None:
-        of_limit = special.expit((steepness + limit[:, :1]) / limit[:, 1:])
-        fails += passes * of_limit
-        passes *= 1.0 - of_limit
 
-    fails *= strength[:, None]
-    passes *= strength[:, None]
-    fails += FLOOR
-    passes += FLOOR
-    return fails, passes
+@_compiled
+def _betas(logit, steepness, limit, strength):
+    """Compute the result of `prior_betas` from the logits (point, bound)."""
+    a = np.empty(logit.shape)
+    b = np.empty(logit.shape)
+    for i in range(len(logit)):
+        for j in range(len(steepness)):
+            fails = 1.0 / (1.0 + math.exp(-logit[i, j]))
+            passes = 1.0 - fails  # rounds to 0 below 1e-16, where FLOOR applies anyway
+
+            beyond = (steepness[j] + limit[i, 0]) / limit[i, 1]
+            if not (beyond < _FAR_BELOW and fails > _NOTICED):  # else the limit changes no digit
+                of_limit = 1.0 / (1.0 + math.exp(-beyond))
+                fails += passes * of_limit
+                passes *= 1.0 - of_limit
+
+            a[i, j] = fails * strength[i] + FLOOR
+            b[i, j] = passes * strength[i] + FLOOR
+    return a, b
 
 
 def steepness_of(tilt: np.ndarray, max_slope: float) -> np.ndarray:
