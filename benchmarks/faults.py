@@ -74,7 +74,7 @@ FAULTS = (
     Fault("a bound that failed is also counted as passed", "hazard/risk.py",
           "b += trials - failed", "b += trials"),
     Fault("the margin raises the slope limit", "hazard/prior.py",
-          "expit((steepness + limit[:, :1])", "expit((steepness - limit[:, :1])"),
+          "(steepness[j] + limit[i, 0])", "(steepness[j] - limit[i, 0])"),
     Fault("the loss of a bound is clipped a second time", "planning/problem.py",
           "lost = 1.0 - self.likelihood.mean_rate(trust, noise_sd[..., None])",
           "lost = (1.0 - self.likelihood.mean_rate(trust, noise_sd[..., None])).clip(0.0, 1.0)"),

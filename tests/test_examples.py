@@ -138,6 +138,11 @@ def write_files(text, prepared):
             tb.logs.write_missions(name, prepared.missions)
         elif name == "log.csv":
             tb.logs.to_frame(prepared.missions).to_csv(name, index=False)
+        elif name == "legs.csv":
+            frame = tb.logs.to_frame(prepared.missions)
+            frame.rename(columns={"bound": "leg"}).to_csv(name, index=False)
+            named = [f'{column} = "{column}"' for column in frame if column != "bound"]
+            Path("columns.toml").write_text("\n".join(['bound = "leg"', *named]))
         elif name == "log.bag":
             record(prepared.missions, Path(name))
         elif name == "points.laz":

@@ -140,9 +140,8 @@ def read_table(
 
     Example:
         >>> missions = tb.logs.read_table("log.csv")
-        >>> missions = tb.logs.read_table(
-        ...     "legs.csv", columns={"bound": "leg", "contact_rate": {"column": "pct", "unit": "%"}}
-        ... )
+        >>> columns = tb.logs.read_columns("columns.toml")  # names and units of another table
+        >>> missions = tb.logs.read_table("legs.csv", columns=columns)
         >>> posterior = tb.fit(missions, workspace=workspace)
     """
     given = Columns(table, columns=columns)
