@@ -128,6 +128,15 @@ class Prepared:
         return tb.study.Scene(self.workspace, simulator, START, GOAL, truth=truth)
 
 
+def write_tables(missions):
+    """Write a table, and the same with another name of a column and the file that says so."""
+    frame = tb.logs.to_frame(missions)
+    frame.to_csv("log.csv", index=False)
+    frame.rename(columns={"bound": "leg"}).to_csv("legs.csv", index=False)
+    named = [f'{column} = "{column}"' for column in frame if column != "bound"]
+    Path("columns.toml").write_text("\n".join(['bound = "leg"', *named]))
+
+
 def write_files(text, prepared):
     """Write the files that an example reads to the working directory."""
     files = re.findall(r'"(\w+(?:\.\w+)?)"', text)
@@ -136,13 +145,8 @@ def write_files(text, prepared):
             prepared.terrain[Path(name).stem].rio.to_raster(name)
         elif name == "missions.nc":
             tb.logs.write_missions(name, prepared.missions)
-        elif name == "log.csv":
-            tb.logs.to_frame(prepared.missions).to_csv(name, index=False)
-        elif name == "legs.csv":
-            frame = tb.logs.to_frame(prepared.missions)
-            frame.rename(columns={"bound": "leg"}).to_csv(name, index=False)
-            named = [f'{column} = "{column}"' for column in frame if column != "bound"]
-            Path("columns.toml").write_text("\n".join(['bound = "leg"', *named]))
+        elif name in ("log.csv", "legs.csv"):
+            write_tables(prepared.missions)
         elif name == "log.bag":
             record(prepared.missions, Path(name))
         elif name == "points.laz":
