@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import re
 import secrets
 import signal
 import stat
@@ -27,17 +26,6 @@ _SIDE_FILES = (
     ".vat.dbf", ".vat.cpg",
 )  # fmt: skip
 """What GDAL and GIS append to the name of a raster to store its statistics, overviews and mask."""
-
-
-_NAME = re.compile(r"(?:\w|[^\x00-\x7f])(?:[^\x00-\x1f/\x7f]*[^\x00-\x20/\x7f])?")
-"""Names of variables and dims that netCDF accepts."""
-_LONGEST_NAME = 250
-"""Largest number of bytes of such a name; netCDF accepts 256."""
-
-
-def is_storable_name(name: str) -> bool:
-    """Return whether a variable or dim of a netCDF file can have this name."""
-    return _NAME.fullmatch(name) is not None and len(name.encode()) <= _LONGEST_NAME
 
 
 def to_path(path: FilePath) -> Path:

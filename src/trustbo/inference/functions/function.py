@@ -2,7 +2,7 @@
 
 import inspect
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from difflib import get_close_matches
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -21,8 +21,7 @@ from numpyro.infer.util import log_density
 from numpyro.primitives import Messenger, sample
 
 from trustbo.display import joined
-from trustbo.errors import TrustboError, one_line, warn
-from trustbo.files import is_storable_name
+from trustbo.errors import TrustboError, warn
 from trustbo.inference.functions.data import NAMES, RATES, Data, FeatureNames, arrays_of
 from trustbo.inference.functions.explain import explained
 from trustbo.inference.functions.identity import constants_of, fingerprint, name_of
@@ -173,7 +172,6 @@ class FunctionModel:
         if not free:
             raise TrustboError(f"{self.in_short()} has no latent variable to learn; sample one.")
 
-        self._require_storable_names(trace)
         self._require_features_in_range(data)
         plates = plates_of_rates(trace)
         with explained(self.in_short(), data):
@@ -304,17 +302,6 @@ class FunctionModel:
                 "from functions that call numpyro.sample. The model is compiled as a whole."
             )
         self._runs_again = True
-
-    def _require_storable_names(self, trace: Mapping[str, Any]) -> None:
-        """Raise TrustboError if a posterior could not be stored because of a name in the trace."""
-        dims = [dim for site in trace.values() for dim in _dims_named_in(site)]
-        for name in map(str, [*trace, *dims]):
-            if not is_storable_name(name):
-                raise TrustboError(
-                    f"{self.in_short()} has a site, plate or dim with the name {one_line(name)}, "
-                    "which netCDF files cannot store; begin with a letter or a digit, end with no "
-                    "space, and use no '/' (in numpyro.handlers.scope, give divider='.')."
-                )
 
     def _require_features_in_range(self, data: Data) -> None:
         """Raise TrustboError if the function reads a feature that awareness does not have.
@@ -616,8 +603,3 @@ def _inputs_of(function: Callable[..., Any], name: str) -> tuple[str, ...]:
                 f"and keeps its default; rename it if the input {alike[0]!r} is meant."
             )
     return takes
-
-
-def _dims_named_in(site: Mapping[str, Any]) -> Sequence[Any]:
-    """Return the names that a site of a trace gives to its axes."""
-    return (site.get("infer") or {}).get("event_dims") or []
