@@ -188,8 +188,7 @@ class Columns:
                 f"{self.what} lacks {column}; it has {there}. Choose or rename one, and "
                 f"{see('howto/your-own-robots')}."
             )
-        blank = pd.Series(np.nan, self.frame.index)
-        return blank if name is None else pd.Series(self.frame[name])
+        return pd.Series(np.nan if name is None else self.frame[name], self.frame.index)
 
 
 def seconds_of(first: Columns, second: Columns) -> list[np.ndarray]:

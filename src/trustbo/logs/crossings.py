@@ -177,6 +177,15 @@ class _Lead:
                 reached.append(k)
         return reached
 
+    def further_along(
+        self, path: Sequence[Cell], reached: Sequence[int]
+    ) -> tuple[int, Cell] | None:
+        """Return the first tick and cell after a missed cell of a path; None if there is none."""
+        n = len(reached)
+        further = {*path[n + 1 :]} - {*path[:n]}
+        entered = self.entered(reached[-1] if reached else 0)
+        return next(((k, cell) for k, cell in entered if cell in further), None)
+
     def driven(self, begin: int, end: int) -> list[Cell]:
         """Return the cells that the lead drives through between two ticks.
 
@@ -277,8 +286,7 @@ def _with_detours(stations: Sequence[Station], lead: _Lead) -> Sequence[Station]
         if not 0 < n < len(path):
             break
 
-        further = {*path[n + 1 :]} - {*path[:n]}
-        back = next(((k, cell) for k, cell in lead.entered(reached[-1]) if cell in further), None)
+        back = lead.further_along(path, reached)
         if back is None:
             break
 
@@ -332,15 +340,11 @@ def _require_bound(
             f"`Campaign.fail` if no bound was run.{hint}"
         )
 
-    later = [
-        cell
-        for _, cell in lead.entered(reached[-1] if reached else 0)
-        if cell in {*path[n + 1 :]} - {*path[:n]}
-    ]
-    if later:
+    later = lead.further_along(path, reached)
+    if later is not None:
         raise TrustboError(
             f"the lead never enters cell {path[n]}, number {n} of the path (0 is the start), but "
-            f"enters {later[0]}, which is further along. Pass the path that was driven, or leave "
+            f"enters {later[1]}, which is further along. Pass the path that was driven, or leave "
             f"path= out to take it from the poses.{hint}"
         )
 
