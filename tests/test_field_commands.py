@@ -64,8 +64,10 @@ def test_a_week_at_a_shell_is_that_of_a_campaign_in_python(ground, tmp_path, cap
     assert asked(ground).robots == ("alpha", "charlie")
     assert call("tell", week, drive(ground, 1)) == 0
 
-    assert call("ways", week, "bridge", "camp") == 0
-    assert all(name in capsys.readouterr().out for name in ("shortest",))
+    assert call("ways", week, "bridge", "camp", "--picture", tmp_path / "ways.png") == 0
+    said = capsys.readouterr().out
+    assert all(name in said for name in ("recommended", "safest", "shortest", "degrees"))
+    assert (tmp_path / "ways.png").read_bytes().startswith(b"\x89PNG")
     assert call("ask", week, "bridge", "camp", "--way", 0) == 0
     assert call("fail", week, "stuck", "--where", ",".join(map(str, asked(ground).path[1]))) == 0
     assert call("ask", week, "camp", "bridge") == 0
@@ -152,6 +154,7 @@ def test_mud_at_a_shell_teaches_no_slope(ground, capsys):
         ("reopen", "week", "9", "--reason", "open"),
         ("status", "absent"),
         ("ways", "week", "camp", "camp"),
+        ("ways", "week", "camp", "hill", "--picture", "ways.unknown"),
         ("resume", "week"),
         ("new", "week", *MAPS),
         ("new", "other", *MAPS, "--place", "camp=50,50"),

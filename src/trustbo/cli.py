@@ -162,6 +162,7 @@ def _add_field_commands(command: Callable[..., Any]) -> None:
 
     add = on_folder(field.ways, "Compare ways by contact, arrival and metres.", "camp hill")
     add_course(add)
+    add("--picture", type=Path, metavar="FILE", help="image file for a map of the ways")
 
     add = on_folder(field.tell, "Record the log of a mission, and learn from it.", "log.csv")
     add_log(add)
@@ -310,20 +311,13 @@ def info(args: argparse.Namespace) -> None:
     import matplotlib.pyplot as plt
 
     import trustbo as tb
-    from trustbo.files import write_file
+    from trustbo.plots.style import save_figure
 
     workspace = _workspace(args)
     print(workspace)
     print(_passable(workspace))
     plt.switch_backend("agg")
-    tb.plots.grid_map(workspace)
-    picture = io.BytesIO()
-    try:
-        plt.savefig(picture, format=args.out.suffix[1:] or "png", dpi=150)
-    except ValueError as error:  # a format that Matplotlib does not know
-        raise TrustboError(f"--out: {error}.") from None
-
-    write_file(args.out, picture.getvalue())
+    save_figure(args.out, tb.plots.grid_map(workspace))
     print(f"the figure of the grid is in {args.out}")
 
 

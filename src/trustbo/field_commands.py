@@ -22,6 +22,8 @@ COLUMNS_FILE = "columns.toml"
 """File in the folder of a campaign with the columns of its logs; see `logs.read_columns`."""
 _STATUS = ("start", "goal", "robots", "status", "state", "contact_lost", "n_bounds", "reason")
 """Columns of the table that `status` prints."""
+_WAYS = ["name", "bounds", "metres", "contact_lost", "p_arrive", "price", "path"]
+"""Columns of the table that `ways` prints."""
 
 
 def loaded(folder: Path) -> "Campaign":
@@ -49,7 +51,6 @@ def ask(args: Namespace) -> None:
         workspace = campaign.workspace
         robots = ", ".join(plan.robots)
         print(f"{workspace.name_of(plan.start)} to {workspace.name_of(plan.goal)}, with {robots}")
-        print(parts_text(campaign, plan))
         print(plan)
         if args.nav2 is not None:
             write_nav2(args.nav2, plan)
@@ -59,30 +60,30 @@ def ask(args: Namespace) -> None:
             print(f"the path is in {args.geojson}")
 
 
-def parts_text(campaign: "Campaign", plan: "Plan") -> str:
-    """Return the parts of a plan's value: contact lost and the price of failure, as text."""
-    from trustbo.campaign.course import Course
-
-    problem = campaign.planner_of(Course.of(plan)).problem
-    if not problem.objective.of_contact:
-        return f"value {plan.value:.2f} ({plan.objective})"
-    price = problem.failure_along(plan.stations)
-    lost = problem.contact_lost(plan.stations, plan.value)
-    cost = problem.cost_of_failure
-    return (
-        f"contact lost: {lost:.2f} of {len(plan.path) - 1} bounds; price of failure: {price:.2f} "
-        f"({cost:g} bounds times its probability); {plan.length:.0f} m"
-    )
-
-
 def ways(args: Namespace) -> None:
-    """Print the ways of a course; none is recorded."""
+    """Print the ways of a course, and what the slope limit costs; none is recorded."""
+    import matplotlib.pyplot as plt
+
+    from trustbo import plots
+    from trustbo.plots.style import save_figure
+
     with loaded(args.folder) as campaign:
-        table = campaign.ways(args.start, args.goal, robots=args.robots).to_frame()
-        table["metres"] = table["metres"].round().astype(int)
-        shown = ["name", "bounds", "metres", "contact_lost", "p_arrive", "price", "path"]
-        print(table[shown].to_string(float_format="%.3f"))
+        found = campaign.ways(args.start, args.goal, robots=args.robots)
+        print(_text(found.to_frame()[_WAYS]))
         print("to drive way K: trustbo ask FOLDER START GOAL --way K")
+        if campaign.workspace.terrain is not None:
+            print("the recommended way, if the robots withstood other slopes:")
+            print(_text(campaign.limits(args.start, args.goal, robots=args.robots)))
+        if args.picture is not None:
+            plt.switch_backend("agg")
+            save_figure(args.picture, plots.ways_map(found))
+            print(f"the map of the ways is in {args.picture}")
+
+
+def _text(ways: Any) -> str:
+    """Return a table of ways as text."""
+    metres = ways["metres"].round().astype(int)
+    return ways.assign(metres=metres).to_string(float_format="%.3f")
 
 
 def tell(args: Namespace) -> None:

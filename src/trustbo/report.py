@@ -21,6 +21,7 @@ from trustbo.errors import require_kind
 from trustbo.files import FilePath, write_text
 from trustbo.planning.plan import in_draws, past_failures_of
 from trustbo.plots.style import drawing
+from trustbo.workspace.closed import closed_text
 
 __all__ = ["write_report"]
 __dir__ = __all__.copy  # tab completion lists only public names
@@ -120,10 +121,11 @@ def facts_of(result: Result) -> dict[str, str]:
     sign = -1.0 if lost else 1.0
     value = _number(sign * plan.value) + (" bounds" if lost else "")
     value += in_draws(plan.value_band, sign)
-    cost = result.planner.problem.cost_of_failure
-    if cost:
-        value += f"; includes a cost of {_number(cost)} bounds if the mission fails"
+    if plan.price_of_failure:
+        value += f": {plan.parts}"
     facts["Predicted contact lost" if lost else "Objective"] = value
+    if plan.workspace.closed:
+        facts["Closed"] = closed_text(plan.workspace.closed, plan.workspace.name_of)
 
     status = result.history["status"].values[-1]
     return facts | {
@@ -237,6 +239,8 @@ def _pictures(result: Result, path_table: pd.DataFrame) -> dict[str, str]:
         weakest = path_table.iloc[1:].nsmallest(_SHOWN, "contact").index
         draw["path"] = lambda: plots.plan_map(plan, bounds=[])
         draw["weakest"] = lambda: plots.plan_map(plan, bounds=sorted(weakest))
+    if plan.contact_lost is not None:
+        draw["ways"] = lambda: plots.ways_map(result.ways())
     return {name: _picture(figure) for name, figure in draw.items()}
 
 
@@ -284,14 +288,27 @@ def _tables(result: Result, path_table: pd.DataFrame) -> dict[str, str]:
     kept = [name for name in ("mean", "sd", "eti89_lb", "eti89_ub") if name in parameters]
 
     courses = courses_of(result)
+    closings: Any = result.closings()
+    closings = closings[closings["over"] == ""].drop(columns="over")
+    plan = result.plan()
+    ways: Any = None if plan.contact_lost is None else result.ways().to_frame()
     return {
         "bounds": _table(bounds),
         "missions": _table(missions),
         "courses": _table(courses) if len(courses) > 1 else "",
+        "ways": "" if ways is None else _of_ways(ways),
+        "limits": "" if ways is None or plan.stops is None else _of_ways(result.limits()),
+        "closings": _table(closings) if len(closings) else "",
         "diagnostics": _table(_listed(diagnostics, "diagnostic")),
         "parameters": _table(parameters[kept].rename_axis("parameter")),
         "settings": _table(_listed(_settings(result), "setting")),
     }
+
+
+def _of_ways(table: Any) -> str:
+    """Return a table of ways as HTML."""
+    table = table.rename(columns={"p_arrive": "p(arrival)", "contact_lost": "contact lost"})
+    return _table(table.assign(metres=table["metres"].round().astype(int)))
 
 
 def _settings(result: Result) -> dict[str, str]:

@@ -64,3 +64,42 @@ def test_ways_of_another_objective_are_refused():
     other = Planner(planner.workspace, *ENDS, "mean")
     with pytest.raises(tb.TrustboError, match="lost_contact"):
         ways_of(other, params)
+
+
+def test_the_value_of_a_plan_is_the_sum_of_its_parts():
+    planner, params = random_problem(np.random.default_rng(3))
+    plan = planner.with_failure_cost(4.0).plan(params)
+    lost, p_fail, _ = numbers_of(planner, params, plan.stations)
+    assert plan.contact_lost == pytest.approx(lost)
+    assert plan.price_of_failure == pytest.approx(4.0 * p_fail)
+    assert "price of failure" in repr(plan)
+    terminal = Planner(planner.workspace, *ENDS, objective="terminal").plan(params)
+    assert terminal.contact_lost is None
+    assert "parts" not in repr(terminal)
+
+
+def test_the_recommended_way_is_listed_with_any_cost_of_failure_and_any_number_of_ways():
+    planner, params = random_problem(np.random.default_rng(8))
+    for cost in (0.0, 2.7, 40.0):
+        priced = planner.with_failure_cost(cost)
+        table = ways_of(priced, params, most=1).to_frame()
+        (named,) = table[table["name"].str.contains("recommended")]["price"]
+        assert named == pytest.approx(-priced.plan(params).value, abs=1e-4)
+
+
+def test_a_slope_limit_two_degrees_lower_is_that_of_a_margin_two_degrees_larger():
+    """A way that is as steep as the stated limit gains most from two degrees more."""
+    workspace = tb.Workspace.from_terrain(hillside(90.0, 120.0), (3, 4))
+    campaign = tb.Campaign(workspace, progress=False)
+    table = campaign.limits((2, 0), (0, 3))
+    assert table.index.tolist() == [-2.0, 0.0, 2.0]
+    assert (np.diff(table["value"]) >= 0.0).all()
+
+    hazard = campaign.hazard
+    shifted = hazard.assign(margin=hazard["margin"] + 2.0)
+    risk = tb.hazard.BoundRisk(shifted, workspace)
+    plan = Planner(workspace, (2, 0), (0, 3)).with_risk(risk).plan(campaign.belief.mean())
+    assert table.loc[-2.0, "value"] == pytest.approx(plan.value)
+    assert table.loc[-2.0, "contact_lost"] == pytest.approx(plan.contact_lost)
+    with pytest.raises(tb.TrustboError, match="degrees"):
+        campaign.limits((2, 0), (0, 3), degrees=0.0)

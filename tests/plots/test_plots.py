@@ -317,7 +317,7 @@ def page(result, tmp_path_factory):
 def test_the_report_is_one_page_with_the_path_and_every_figure(result, page):
     html = page.read_text(encoding="utf-8")
     assert "→".join(f" {row},{col} " for row, col in result.path).strip() in html
-    assert html.count('src="data:image/png;base64,') == 5
+    assert html.count('src="data:image/png;base64,') == 6
     assert "http" not in html
 
     first, *_ = html.partition("<section")

@@ -20,7 +20,13 @@ from trustbo.campaign.settings import to_planner
 from trustbo.campaign.state import EARLIER, State
 from trustbo.data import NOWHERE, POST_SETS, Cell, Mission, path_text
 from trustbo.display import Rows, Summary
-from trustbo.errors import TrustboError, require_choice, require_kind, require_switch
+from trustbo.errors import (
+    TrustboError,
+    require_choice,
+    require_kind,
+    require_positive,
+    require_switch,
+)
 from trustbo.files import FilePath
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference.learner import Learner
@@ -32,7 +38,7 @@ from trustbo.parallel import computing
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.maps import maps_of
 from trustbo.planning.robot_trust import robot_maps, robot_trust
-from trustbo.planning.ways import Ways, ways_of
+from trustbo.planning.ways import Ways, limits_table, ways_of
 from trustbo.simulation import Truth
 from trustbo.stacking import padded
 from trustbo.workspace import Workspace
@@ -363,9 +369,11 @@ class Result(Summary):
         return self._recommended(self._shown(start, goal, robots))
 
     def _recommended(self, course: Course) -> Plan:
-        planner = self.planner_of(course)
-        belief = self._belief_of(course)
-        mean = belief.mean()
+        return self._best(self.planner_of(course), course)
+
+    def _best(self, planner: Planner, course: Course) -> Plan:
+        """Return the best plan of a planner of a course or, beyond `max_failure`, the safest."""
+        mean = self._belief_of(course).mean()
         try:
             return planner.plan(mean)
         except InfeasibleError as error:
@@ -528,6 +536,55 @@ class Result(Summary):
         return self._of_course(
             "ways", course, lambda: ways_of(self.planner_of(course), self._belief_of(course))
         )
+
+    def limits(
+        self,
+        start: Location | None = None,
+        goal: Location | None = None,
+        *,
+        robots: Sequence[str] | None = None,
+        degrees: float = 2.0,
+    ) -> pd.DataFrame:
+        """Return what the slope limit costs: the best plan, if robots withstood more or less.
+
+        The plans have the failure probabilities of robots whose slope limit is by so many degrees
+        above or below what the missions and the stated limit say. Routes and passable cells are
+        those of the stated limit, so a way through cells that it closes is not found.
+
+        Args:
+            start: First cell, as in `plan`.
+            goal: Last cell, as in `plan`.
+            robots: Names of the robots that take part; by default the whole team.
+            degrees: Change of the slope limit.
+
+        Returns:
+            A table with a row for minus `degrees`, 0 and plus `degrees`, and the columns `bounds`,
+            `metres`, `contact_lost` (None if the objective is another), `p_arrive`, `value` and
+            `path`.
+
+        Raises:
+            TrustboError: There is no terrain, `degrees` is not positive, an end is missing or is
+                not a passable cell, or a robot is unknown.
+            NoPathError: The goal cannot be reached.
+
+        Example:
+            >>> result.limits((9, 0), (0, 9))[["metres", "contact_lost", "p_arrive"]]
+        """
+        require_positive("degrees", degrees)
+        course = self._shown(start, goal, robots)
+        if self.workspace.terrain is None:
+            raise TrustboError("limits needs a workspace made with Workspace.from_terrain.")
+
+        def rows() -> pd.DataFrame:
+            plans = {}
+            for change in (-degrees, 0.0, degrees):
+                margin = self.hazard["margin"] - change
+                risk = BoundRisk(self.hazard.assign(margin=margin), self.workspace)
+                planner = informed_planner(self._base_of(course), risk)
+                plans[change] = self._best(planner, course)
+            return limits_table(plans)
+
+        return self._of_course(f"limits {degrees}", course, rows).copy()
 
     def watchers(
         self,

@@ -10,6 +10,7 @@ from trustbo.planning.problem import InfeasibleError
 from trustbo.planning.recursion import expected_trust
 from trustbo.planning.threats import threat_map
 from trustbo.planning.watchers import at_least, contact_dependence
+from trustbo.planning.ways import Ways
 
 __all__ = [
     "OBJECTIVES",
@@ -18,6 +19,7 @@ __all__ = [
     "NoPathError",
     "Plan",
     "Planner",
+    "Ways",
     "at_least",
     "contact_dependence",
     "expected_trust",

@@ -51,6 +51,7 @@ def evaluated(
         risk=None if problem.risk is None else problem.risk.along(path),
         infeasible=not problem.is_within_limit(path),
         value_band=value_band,
+        price_of_failure=cost,
     )
 
 

@@ -92,6 +92,8 @@ class Plan(Fixed, Summary):
             `p_fail`; only the plans of campaigns have them.
         post_sets: Name of the set of posts from which T2 watches each bound (see
             `Workspace.from_terrain`); empty if all are standard.
+        price_of_failure: Expected cost of failure in bounds, which the value includes; see
+            `Planner`. 0 if failures have no cost.
 
     Example:
         >>> plan = tb.Planner(workspace, (9, 0), (0, 9)).plan(posterior)
@@ -117,6 +119,7 @@ class Plan(Fixed, Summary):
     abandoned: tuple[tuple[Station, ...], ...] = ()
     past_failures: tuple[PastFailure, ...] = ()
     post_sets: tuple[str, ...] = ()
+    price_of_failure: float = 0.0
 
     def __post_init__(self) -> None:
         require_switch("exact", self.exact)
@@ -139,6 +142,7 @@ class Plan(Fixed, Summary):
             ("path", f"{path_text(self.path)}: {len(self.path) - 1} bounds, {self.length:.0f} m"),
             *([("posts", sets_text(self.post_sets))] if self.post_sets else []),
             ("value", f"{self.value:z.3g} ({self.objective}){in_draws(self.value_band)}"),
+            *([("parts", self.parts)] if self.parts else []),
             ("best", best),
             ("trust at the goal", f"{self.trust[-1].mean():.3f}, mean of the robots"),
         ]
@@ -229,6 +233,27 @@ class Plan(Fixed, Summary):
         grid = self.workspace.grid
         rows, cols = cells_along(self.path).T
         return mark(np.stack([grid.x[cols], grid.y[rows]], axis=1))
+
+    @property
+    def contact_lost(self) -> float | None:
+        """Expected contact lost in bounds, with bound costs, if no bound fails.
+
+        It is None if the objective is not lost_contact. The value of a plan is minus the sum of
+        this and `price_of_failure`.
+        """
+        if self.objective != "lost_contact":
+            return None
+        return -self.value - self.price_of_failure
+
+    @property
+    def parts(self) -> str:
+        """Parts of the value as text: contact lost and, if it has one, the price of failure."""
+        if self.contact_lost is None:
+            return ""
+        text = f"{self.contact_lost:.2f} of {len(self.path) - 1} bounds of contact lost"
+        if self.price_of_failure:
+            text += f", price of failure {self.price_of_failure:.2f} bounds"
+        return text
 
     @property
     def length(self) -> float:

@@ -5,6 +5,7 @@ team does not arrive, and its length. A way is left out if another one is at lea
 them (Pareto set). Each way is the exact optimum of a weighted sum of the three.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -22,8 +23,8 @@ from trustbo.planning.problem import Problem, mean_and_draws_of
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
-_NAMES = "best contact", "safest", "shortest"
-"""Names of the ways with the smallest of each number."""
+_NAMES = "recommended", "best contact", "safest", "shortest"
+"""Names of the ways with the smallest price, and with the smallest of each number."""
 MOST = 6
 """Largest number of ways that are listed."""
 _COSTS_OF_FAILURE = (1e-6, 0.3, 1.0, 3.0, 10.0, 1e4)
@@ -45,6 +46,10 @@ class Ways(Summary):
         numbers: Contact lost (bounds), failure probability and length (m) of each way, shape (way,
             3).
         cost_of_failure: Cost of a failure in plans, in bounds.
+
+    Example:
+        >>> ways = result.ways((9, 0), (0, 9))
+        >>> ways.to_frame()[["name", "contact_lost", "p_arrive", "metres"]]
     """
 
     plans: tuple[Plan, ...]
@@ -72,12 +77,14 @@ class Ways(Summary):
     def to_frame(self) -> pd.DataFrame:
         """Return a table with a row for each way, numbered from 0.
 
-        The columns are `name` ("best contact", "safest", "shortest" or several of them), `bounds`,
-        `metres`, `contact_lost` (bounds, if no bound fails), `p_arrive`, `price` (contact lost plus
-        the cost of a failure times its probability), `path` and, with several sets, `posts`.
+        The columns are `name` ("recommended" for the least price, "best contact", "safest",
+        "shortest" or several of them), `bounds`, `metres`, `contact_lost` (bounds, if no bound
+        fails), `p_arrive`, `price` (contact lost plus the cost of a failure times its probability),
+        `path` and, with several sets, `posts`.
         """
+        price = self.numbers[:, 0] + self.cost_of_failure * self.numbers[:, 1]
         names: list[list[str]] = [[] for _ in self.plans]
-        for what, column in zip(_NAMES, self.numbers.T, strict=True):
+        for what, column in zip(_NAMES, [price, *self.numbers.T], strict=True):
             names[int(np.argmin(column))].append(what)
 
         plans = self.plans
@@ -88,7 +95,7 @@ class Ways(Summary):
                 "metres": self.numbers[:, 2],
                 "contact_lost": self.numbers[:, 0],
                 "p_arrive": 1.0 - self.numbers[:, 1],
-                "price": self.numbers[:, 0] + self.cost_of_failure * self.numbers[:, 1],
+                "price": price,
                 "path": [path_text(plan.path) for plan in plans],
             },
             index=pd.RangeIndex(len(plans), name="way"),
@@ -98,13 +105,30 @@ class Ways(Summary):
         return table
 
 
+def limits_table(plans: Mapping[float, Plan]) -> pd.DataFrame:
+    """Return a table with a row for each plan, keyed by the change of the slope limit, degrees."""
+    rows = [
+        {
+            "bounds": len(plan.path) - 1,
+            "metres": plan.length,
+            "contact_lost": plan.contact_lost,
+            "p_arrive": plan.p_arrive,
+            "value": plan.value,
+            "path": path_text(plan.path),
+        }
+        for plan in plans.values()
+    ]
+    return pd.DataFrame(rows, index=pd.Index(list(plans), name="degrees"))
+
+
 def ways_of(planner: Planner, belief: Draws, most: int = MOST) -> Ways:
     """Find at most `most` ways; see the module.
 
     Args:
         planner: Planner with the objective lost_contact, and the risk of bounds, if known.
         belief: Draws of the parameters, as for `Planner.plan`.
-        most: Largest number of ways. The best one in each respect is always listed.
+        most: Largest number of ways. The one with the least price, and the best one in each
+            respect, are always listed.
 
     Raises:
         TrustboError: The objective is not lost_contact.
@@ -123,12 +147,15 @@ def ways_of(planner: Planner, belief: Draws, most: int = MOST) -> Ways:
     mean, draws = mean_and_draws_of(belief, workspace)
     recursion = problem.searched(mean)
 
-    costs = (0.0,) if problem.risk is None else _COSTS_OF_FAILURE
+    shortest = problem.paths.shortest
+    costs = {0.0}
+    if problem.risk is not None:
+        costs = {*_COSTS_OF_FAILURE, problem.cost_of_failure / shortest}
     found: dict[tuple[Station, ...], None] = {}  # in order
-    for of_failure, of_length in product(costs, _COSTS_OF_LENGTH):
+    for of_failure, of_length in product(sorted(costs), _COSTS_OF_LENGTH):
         weighted = replace(
             problem,
-            failure_cost=of_failure * problem.paths.shortest,
+            failure_cost=of_failure * shortest,
             bound_cost=problem.bound_cost + of_length / side * lengths,
         )
         _, _, paths = weighted.best(recursion)
@@ -136,7 +163,7 @@ def ways_of(planner: Planner, belief: Draws, most: int = MOST) -> Ways:
 
     plans = [evaluated(problem, stations, mean, None, None) for stations in found]
     numbers = np.array([_numbers_of(problem, plan) for plan in plans])
-    chosen = _some(numbers, most)
+    chosen = _some(numbers, problem.cost_of_failure, most)
     with_bands = tuple(evaluated(problem, plans[k].stations, mean, draws, None) for k in chosen)
     return Ways(with_bands, numbers[chosen], problem.cost_of_failure)
 
@@ -153,22 +180,25 @@ def _lengths(workspace: Workspace) -> np.ndarray:
     return np.hypot(*(np.array(MOVES) * sides).T)[:, None, None]
 
 
-def _some(numbers: np.ndarray, most: int) -> np.ndarray:
+def _some(numbers: np.ndarray, cost_of_failure: float, most: int) -> np.ndarray:
     """Choose ways that no other one beats, at most `most`, in the order of contact lost.
 
-    The best in each respect are chosen first, then those that are farthest from the chosen ones.
+    The one with the least price and the best in each respect are chosen first, then those that are
+    farthest from the chosen ones.
 
     Args:
         numbers: Contact lost, failure probability and length, shape (way, 3).
+        cost_of_failure: Cost of a failure, in bounds.
         most: Largest number of ways.
     """
     at_least = (numbers[:, None] <= numbers + _TIE).all(-1)  # (way, other): as good in all
     beaten = (at_least & (numbers[:, None] < numbers - _TIE).any(-1)).any(0)
     kept = np.flatnonzero(~beaten)
     points = numbers[kept]
+    cheapest = int(np.argmin(points[:, 0] + cost_of_failure * points[:, 1]))
     points = (points - points.min(0)) / np.maximum(np.ptp(points, axis=0), _TIE)
 
-    chosen = [*dict.fromkeys(points.argmin(0).tolist())]
+    chosen = [*dict.fromkeys([cheapest, *points.argmin(0).tolist()])]
     while len(chosen) < min(most, len(kept)):
         away = np.linalg.norm(points[:, None] - points[chosen], axis=-1).min(1)
         chosen.append(int(away.argmax()))

@@ -6,3 +6,4 @@ from .maps import grid_map as grid_map
 from .maps import terrain_maps as terrain_maps
 from .maps import trust_maps as trust_maps
 from .plan import plan_map as plan_map
+from .plan import ways_map as ways_map

@@ -1,6 +1,7 @@
 """Maps of each bound of a plan: stops of the lead, posts, sight lines and routes."""
 
 from collections.abc import Iterable, Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,19 @@ from matplotlib.patches import Patch
 
 from trustbo.data import path_text
 from trustbo.errors import TrustboError, require_kind, require_list, require_whole
-from trustbo.planning import Plan
-from trustbo.plots.maps import draw_contours, draw_path, draw_scale, extent_of, set_frame
+from trustbo.planning import Plan, Ways
+from trustbo.plots.maps import (
+    draw_contours,
+    draw_path,
+    draw_places,
+    draw_scale,
+    extent_of,
+    positions_of,
+    set_frame,
+)
 from trustbo.plots.style import (
     GREY,
+    ROBOTS,
     add_legend,
     background,
     handles_of,
@@ -35,6 +45,12 @@ _HALF = 0.56
 """Half the width of the map of a bound, relative to what it must show."""
 _SMALL = 3.5
 """Size of the posts in the map of the path, in points."""
+_WIDTHS = (8.0, 6.5, 5.0, 3.5, 2.2, 1.0)
+"""Widths of the lines of ways, in points; later ways are drawn over earlier ones."""
+_WAYS_WIDTH = 5.6
+"""Width of a new map of ways, in inches."""
+_WAYS_LEGEND = 1.3
+"""Height of its legend, in inches."""
 _LEAST_HALF = 2.0
 """Half the width of a map that shows a single point, m."""
 
@@ -88,6 +104,47 @@ def plan_map(plan: Plan, *, bounds: Sequence[int] | None = None, ax: Any = None)
     handles = of_bounds if len(shown) else handles_of(axes[0])
     add_legend(axes, [*handles, Patch(facecolor=_VEGETATION, label="vegetation")])
     return axes
+
+
+@styled
+def ways_map(ways: Ways, *, ax: Axes | None = None) -> Axes:
+    """Plot a map of ways between two cells, with what each of them costs in the legend.
+
+    Where several ways coincide, the first one is drawn broadest.
+
+    Args:
+        ways: Ways to plot, such as `Result.ways(start, goal)`.
+        ax: Axes to draw on; by default a new figure.
+
+    Example:
+        >>> tb.plots.ways_map(result.ways())
+    """
+    require_kind("ways", ways, Ways, "give ways, such as Result.ways()")
+    workspace = ways[0].workspace
+    left, right, bottom, top = extent_of(workspace.grid)
+    tall = float(np.clip((top - bottom) / (right - left), 0.3, 1.6))
+    axes = panels(1, ax, (_WAYS_WIDTH, _WAYS_WIDTH * tall + _WAYS_LEGEND))
+    panel = axes[0]
+    set_frame(panel, workspace.grid, xticks=[], yticks=[])
+    draw_scale(panel)
+    if workspace.terrain is not None:
+        draw_ground(panel, workspace)
+    draw_places(panel, workspace)
+
+    rows: list[dict[str, Any]] = ways.to_frame().to_dict("records")
+    looks = zip(rows, ways.plans, cycle(ROBOTS), _WIDTHS, strict=False)
+    for k, (row, plan, colour, width) in enumerate(looks):
+        places = positions_of(plan.path, workspace.grid)
+        label = f"way {k}: {row['name']}".removesuffix(": ")
+        label += f"\n{row['contact_lost']:.2f} bounds lost, arrival {row['p_arrive']:.3f}, "
+        label += f"{row['metres']:.0f} m"
+        panel.plot(*places.T, color=colour, linewidth=width, label=label, zorder=4)
+
+    ends = positions_of([ways[0].start, ways[0].goal], workspace.grid)
+    for place, marker in zip(ends, ("o", "*"), strict=True):
+        panel.plot(*place, marker, **_filled(ink(), 9.0), zorder=6)
+    add_legend(axes, handles_of(panel), columns=2)
+    return panel
 
 
 def draw_ground(ax: Axes, workspace: Workspace) -> None:

@@ -1,10 +1,12 @@
 """Style, colours and axes of all figures."""
 
+import io
 import math
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import cycle
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -19,6 +21,7 @@ from matplotlib.ticker import AutoLocator
 from matplotlib.transforms import Bbox
 
 from trustbo.errors import TrustboError
+from trustbo.files import FilePath, write_file
 
 RC: dict[str, Any] = {
     "font.size": 8.0,
@@ -159,19 +162,35 @@ def figure_of(axes: Sequence[Axes] | np.ndarray) -> Figure:
     return figure
 
 
+def save_figure(path: FilePath, axes: Any) -> None:
+    """Write the figure of axes to an image file whose ending names the format.
+
+    Raises TrustboError if Matplotlib does not know the format, or the file cannot be written.
+    """
+    picture = io.BytesIO()
+    figure = figure_of(np.ravel(axes))
+    try:
+        figure.savefig(picture, format=Path(path).suffix[1:] or "png", dpi=150)
+    except ValueError as error:
+        raise TrustboError(f"{path}: {error}.") from None
+    write_file(path, picture.getvalue())
+
+
 def handles_of(panel: Axes) -> list[Any]:
     """Return the labelled lines and areas of a panel, for a legend."""
     return panel.get_legend_handles_labels()[0]
 
 
-def add_legend(axes: np.ndarray, handles: Sequence[Any]) -> None:
+def add_legend(axes: np.ndarray, handles: Sequence[Any], *, columns: int = 4) -> None:
     """Add a legend below the axes or, without a constrained layout, inside the first axes.
+
+    It has at most `columns` columns, and at most two in a narrow figure.
 
     Without a constrained layout, narrow axes get no legend, because it would hide the data.
     """
     figure = figure_of(axes)
     if isinstance(figure.get_layout_engine(), ConstrainedLayoutEngine):
-        most = 4 if figure.get_figwidth() >= _WIDE else 2
+        most = columns if figure.get_figwidth() >= _WIDE else min(columns, 2)
         columns = min(len(handles), most)
         figure.legend(handles=handles, loc="outside lower center", ncols=columns)
     elif is_broad(axes[0]):
