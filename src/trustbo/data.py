@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any, NamedTuple, Self
 
@@ -39,6 +40,8 @@ FEATURES = ("traversability", "visibility")
 """Names of the first two features, z1 and z2 of the paper."""
 SHARE_TOLERANCE = 1e-6
 """Largest difference of a contact rate from a multiple of 1 / n_ticks."""
+_EARLIEST = 1e9
+"""Time from which on a clock counts as Unix time, s; others count from some start."""
 _USUAL_LEVELS = 7
 """Number of levels of the scales "likert" and "ordinal"."""
 LINE_OF_SIGHT = "line_of_sight"
@@ -160,6 +163,7 @@ class Mission(Fixed, Summary):
         sightings: Places at which robots saw a threat; see `planning.threat_map`.
         post_sets: Name of the set of posts from which T2 watched each bound of `path` (see
             `Workspace.from_terrain`); empty if all are standard.
+        began: Time at which the mission began, in seconds since 1970-01-01 UTC; NaN if unknown.
 
     Raises:
         TrustboError: The bounds do not fit the path, the arrays disagree on the number of bounds,
@@ -192,6 +196,7 @@ class Mission(Fixed, Summary):
     contact: tuple[np.ndarray | None, ...] = ()
     sightings: tuple[Sighting, ...] = ()
     post_sets: tuple[str, ...] = ()
+    began: float = np.nan
 
     def __post_init__(self) -> None:
         for status in (self.status, *self.bound_status):
@@ -205,6 +210,7 @@ class Mission(Fixed, Summary):
             "post_sets": post_sets,
             "bound_status": tuple(self.bound_status),
             "sightings": _require_sightings(self.sightings),
+            "began": np.nan if np.isnan(self.began) else require_finite("began", self.began),
         }
         kept |= self._measurements() | self._ticks()
 
@@ -297,6 +303,7 @@ class Mission(Fixed, Summary):
             *((f"  {name}", f"{rate:.3f}") for name, rate in by_robot),
             ("features", joined(self.features)),
             ("takes", f"{took:.4g} s" if took else "not measured"),
+            *([] if np.isnan(self.began) else [("began", str(date_of(self.began)))]),
         ]
 
     @classmethod
@@ -478,7 +485,7 @@ class Mission(Fixed, Summary):
         return replace(self, **names, **changes, poses=(), contact=())
 
     def has_same_data(self, other: "Mission") -> bool:
-        """Return whether another mission has the same path, outcome and measurements."""
+        """Return whether another mission has the same path, outcome, measurements and date."""
         about = (
             "path",
             "post_sets",
@@ -490,6 +497,8 @@ class Mission(Fixed, Summary):
             "map",
         )
         if any(getattr(self, name) != getattr(other, name) for name in about):
+            return False
+        if abs(self.began - other.began) > 0.0:  # not if one is unknown
             return False
         return all(
             np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True)
@@ -634,6 +643,16 @@ def is_line_of_sight(feature: str) -> bool:
 def sight_columns(features: Sequence[str]) -> list[int]:
     """Return the indices of the features that are predicted contact rates."""
     return [m for m, name in enumerate(features) if is_line_of_sight(name)]
+
+
+def began_at(t: float) -> float:
+    """Return a time of a log, s, if it is Unix time, or NaN if the clock has another start."""
+    return float(t) if t >= _EARLIEST else np.nan
+
+
+def date_of(began: float) -> datetime:
+    """Return the date of a time in seconds since 1970, to the second, in UTC."""
+    return datetime.fromtimestamp(began, UTC).replace(microsecond=0)
 
 
 def default_features(n_features: int) -> tuple[str, ...]:

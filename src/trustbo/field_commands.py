@@ -20,7 +20,17 @@ _BAG = (".bag", ".mcap", ".db3")
 """Endings of the files of a ROS bag; that of ROS 2 may also be a folder."""
 COLUMNS_FILE = "columns.toml"
 """File in the folder of a campaign with the columns of its logs; see `logs.read_columns`."""
-_STATUS = ("start", "goal", "robots", "status", "state", "contact_lost", "n_bounds", "reason")
+_STATUS = (
+    "began",
+    "start",
+    "goal",
+    "robots",
+    "status",
+    "state",
+    "contact_lost",
+    "n_bounds",
+    "reason",
+)
 """Columns of the table that `status` prints."""
 _WAYS = ["name", "bounds", "metres", "contact_lost", "p_arrive", "price", "path"]
 """Columns of the table that `ways` prints."""

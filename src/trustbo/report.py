@@ -45,7 +45,7 @@ _OF_BOUNDS = {
     "begun": "driven",
 }
 """Headings of the table of bounds, keyed by the columns of `bounds_of`."""
-_OF_MISSIONS = ("start", "goal", "robots", "status", "state", "failed_bounds", "plan",
+_OF_MISSIONS = ("began", "start", "goal", "robots", "status", "state", "failed_bounds", "plan",
                 "contact_rate", "contact_lost", "lost_share", "objective", "n_bounds",
                 "n_unmeasured")  # fmt: skip
 """Columns of the table of missions, if they have values."""
@@ -271,6 +271,7 @@ def _tables(result: Result, path_table: pd.DataFrame) -> dict[str, str]:
         empty.append("lost_share")
     if not (missions["n_unmeasured"] > 0).any():
         empty.append("n_unmeasured")
+    empty += [name for name in ("began",) if name not in missions]
     missions = missions[[name for name in _OF_MISSIONS if name not in empty]]
     if result.settings["objective"] == "lost_contact":
         missions = missions.assign(objective=-missions["objective"])

@@ -218,6 +218,8 @@ def test_saved_result_has_the_earlier_missions(second, tmp_path):
 def test_excluding_all_missions_leaves_the_earlier_posterior(workspace, first):
     campaign = run(workspace, 1, OTHER_ENDS, earlier=first)
     before = campaign.state.initial
+    with pytest.raises(TrustboError, match="mission -1 is of an earlier campaign; correct it ther"):
+        campaign.exclude(-1, "the lidar was covered")
     campaign.exclude(1, "the lidar was covered")
     assert campaign.state.last is before
 

@@ -1,5 +1,7 @@
 """Tables with names, units, positions and times of their own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -116,6 +118,26 @@ def test_a_wrong_mapping_is_one_sentence(field, columns, match):
 def test_a_mapping_that_names_no_column_is_refused(field, columns):
     with pytest.raises(TrustboError, match="columns"):
         tb.logs.read_table(legs(field), columns=columns)
+
+
+def test_dates_say_when_a_mission_and_its_bounds_began(field, tmp_path):
+    [mission] = tb.logs.read_table(legs(field), columns=COLUMNS, workspace=field, path=PATH)
+    begins = [pd.Timestamp(leg, tz=ZONE) for leg in legs(field).groupby("leg")["leg_start"].min()]
+    assert mission.began == begins[0].timestamp()
+    np.testing.assert_allclose(mission.starts, [(t - begins[0]).total_seconds() for t in begins])
+    assert str(begins[0].tz_convert("UTC").floor("s")) in str(mission)
+
+    tb.logs.to_frame([mission]).to_csv(tmp_path / "again.csv", index=False)
+    tb.logs.write_missions(tmp_path / "again.nc", [mission])
+    [of_table] = tb.logs.read_table(tmp_path / "again.csv")
+    [of_file] = tb.logs.read_missions(tmp_path / "again.nc")
+    for again in (of_table, of_file):
+        assert again.began == mission.began
+        np.testing.assert_allclose(again.starts, mission.starts, atol=1e-6)
+
+    later = replace(mission, began=mission.began + 3600.0)
+    assert not later.has_same_data(mission)
+    assert replace(mission, began=np.nan).has_same_data(mission)
 
 
 def test_positions_outside_the_ground_are_named_with_their_row(field):

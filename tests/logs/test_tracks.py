@@ -37,6 +37,14 @@ def test_geometry_is_that_of_the_plane():
     np.testing.assert_array_equal(one.contact_rate[:, 0], [1.0] + [0.0] * 9)
 
 
+def test_unix_times_say_when_a_mission_began():
+    start = 1.7e9
+    poses = {**POSES, "t": [start + t for t in POSES["t"]]}
+    seen = {**SEEN, "t": [start + t for t in SEEN["t"]]}
+    assert [one.began for one in read_tracks(poses, seen, lead="b", window=1.0)] == [start]
+    assert np.isnan([one.began for one in read_tracks(POSES, SEEN, lead="b", window=1.0)]).all()
+
+
 def test_robot_without_detections_is_warned_of():
     seen = {"t": [0.5, 0.7, 2.2], "watcher": [*"aac"], "seen": [*"cca"]}
     with pytest.warns(UserWarning, match="no detection names b"):

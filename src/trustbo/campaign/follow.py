@@ -16,6 +16,7 @@ from trustbo.data import (
     Cell,
     Mission,
     Station,
+    began_at,
     cells_of,
     path_text,
     split_path,
@@ -266,6 +267,7 @@ class Follower(Summary):
             status=status,
             features=workspace.features,
             robots=workspace.team.names,
+            began=began_at(self._started),
         )
 
     def _count(self, t: float, counts: np.ndarray, bound: tuple[Station, Station]) -> None:

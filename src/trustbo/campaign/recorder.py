@@ -132,6 +132,11 @@ class Recorder(Result):
 
     def _require_mission(self, n: int, reason: str) -> None:
         """Raise TrustboError unless mission n counts, and can be excluded for this reason."""
+        if n in self.state.earlier_here:
+            raise TrustboError(
+                f"mission {n} is of an earlier campaign; correct it there, and begin this campaign "
+                "again with earlier=."
+            )
         before = [entry.exclusion and entry.exclusion.reason for entry in self.state.entries]
         self._require_counts("mission", n, reason, before, "excluded")
 

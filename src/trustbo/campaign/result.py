@@ -717,6 +717,8 @@ class Result(Summary):
           rate of the measured robots. Bounds without any rate count as the mean of the mission's
           measured bounds, and bounds that were not run lose all contact.
         - `lost_share`: contact lost, as a share of the bounds of the mission.
+        - `posts`: sets of posts of the bounds, if the plan has some that are not standard.
+        - `began`: time at which the mission began, UTC, if logs say so.
         - Diagnostics of the posterior; see `fit`.
         """
         state = self.state

@@ -11,7 +11,7 @@ import xarray as xr
 
 from trustbo.campaign.closing import Closing, closed_by
 from trustbo.campaign.course import Course
-from trustbo.data import Cell, Mission, Station, cells_of, path_text, split_path
+from trustbo.data import Cell, Mission, Station, cells_of, date_of, path_text, split_path
 from trustbo.errors import TrustboError
 from trustbo.files import read_file
 from trustbo.hazard.trials import CAUSES, LostMission
@@ -171,6 +171,7 @@ def measures_of(mission: Mission, path: Sequence[Station]) -> dict[str, Any]:
         "n_unmeasured": int(np.isnan(rates).all(axis=1).sum()),
         "path": path_text(path),
         **({"posts": " ".join(post_sets)} if post_sets else {}),
+        **({} if np.isnan(mission.began) else {"began": date_of(mission.began)}),
     }
 
 

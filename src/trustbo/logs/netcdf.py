@@ -139,6 +139,7 @@ def missions_to_tree(missions: Iterable[Mission]) -> xr.DataTree:
             f"sighting_{name}": ("sighting", [*values])
             for name, values in zip(Sighting._fields, columns, strict=True)
         }
+    variables["began"] = "mission", [mission.began for mission in missions], {"units": "s"}
     for name in _TEXTS:
         variables[name] = ("mission", [getattr(mission, name) for mission in missions])
 
@@ -171,7 +172,8 @@ def missions_from_tree(tree: xr.DataTree) -> list[Mission]:
         "contact": ticks("contact"),
     }
     table.setdefault("map", np.full(len(table["status"]), ""))  # not in files of version 0.5
-    columns |= {name: table[name].tolist() for name in _TEXTS}
+    table.setdefault("began", np.full(len(table["status"]), np.nan))
+    columns |= {name: table[name].tolist() for name in (*_TEXTS, "began")}
     names = {name: tuple(table[name].tolist()) for name in ("robot", "feature")}
 
     sightings: list[list[Sighting]] = [[] for _ in table["n_bounds"]]

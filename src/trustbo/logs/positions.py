@@ -45,17 +45,20 @@ def with_cells(columns: Columns, workspace: Workspace | None) -> None:
 
 
 def with_durations(columns: Columns) -> None:
-    """Replace the times at which bounds begin and end, in s, by a column duration.
+    """Replace the times at which bounds begin and end, in s, by the columns begin and duration.
 
-    Raises TrustboError if a bound ends before it begins.
+    A column duration that is there stays. Raises TrustboError if a bound ends before it begins.
     """
-    if columns.find("duration") or not all(map(columns.find, _INTERVAL)):
-        return
-
-    begin, end = (columns.numbers(name) for name in _INTERVAL)
+    named = [name for name in map(columns.find, _INTERVAL) if name is not None]
+    begin, end = (columns.numbers(name, required=False) for name in _INTERVAL)
     columns.refuse("end", end < begin, "is before the begin of its row; check both clocks")
-    frame = columns.frame.drop(columns=[columns.find(name) for name in _INTERVAL])
-    columns.frame = frame.assign(duration=end - begin)
+
+    frame = columns.frame.drop(columns=named)
+    if columns.find("begin"):
+        frame = frame.assign(begin=begin)
+    if len(named) == len(_INTERVAL) and not columns.find("duration"):
+        frame = frame.assign(duration=end - begin)
+    columns.frame = frame
 
 
 def with_metres(columns: Columns, grid: Grid | None) -> None:

@@ -1,6 +1,7 @@
 """Missions as tables in long form, with one row per mission, bound and robot."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from trustbo.data import (
     Cell,
     Mission,
     Station,
+    began_at,
     cells_of,
     require_path,
 )
@@ -28,7 +30,9 @@ KEYS = ("mission", "bound", "robot")
 RATES = ("contact_rate", "duration", "n_ticks")
 POSTS = "posts"
 """Column of the set of posts from which T2 watches the lead's move out of a cell."""
-COLUMNS = (*KEYS, "row", "col", POSTS, *RATES, "status")
+BEGIN = "begin"
+"""Column of the time at which a bound began, s."""
+COLUMNS = (*KEYS, "row", "col", POSTS, *RATES, "status", BEGIN)
 """Columns with a fixed meaning; other columns may be features of awareness."""
 TRUST = ("trust_mean", "trust_sd")
 """Columns of a posterior, which `export.write_csv` adds and `read_table` ignores."""
@@ -74,27 +78,32 @@ def to_frame(missions: Iterable[Mission]) -> pd.DataFrame:
             "logs.write_missions."
         )
 
-    rows = []
-    for j, mission in enumerate(missions, start=1):
-        n_run = len(mission.bounds)
-        first = 0 if mission.path else 1
-        for k in range(first, max(len(mission.path), n_run + 1)):
-            for i, robot in enumerate(mission.robots):
-                row: dict[str, Any] = dict(zip(KEYS, (j, k, robot), strict=True))
-                if mission.path:
-                    row["row"], row["col"], row[POSTS] = (*mission.stations[k], POST_SETS[0])[:3]
-                if 1 <= k <= n_run:
-                    bound = mission.bounds[k - 1]
-                    row |= {name: getattr(bound, name)[i] for name in RATES}
-                    row["status"] = mission.status if k == n_run else bound.status
-                    row |= dict(zip(mission.features, bound.awareness[i], strict=True))
-                rows.append(row)
-
+    rows = [row for j, mission in enumerate(missions, start=1) for row in _rows_of(j, mission)]
     absent = set() if missions[0].path else {"row", "col"}
     if not any(mission.post_sets for mission in missions):
         absent.add(POSTS)
+    if np.isnan([mission.began for mission in missions]).all():
+        absent.add(BEGIN)
     names = [name for name in COLUMNS if name not in absent]
     return pd.DataFrame(rows, columns=[*names, *missions[0].features])
+
+
+def _rows_of(j: int, mission: Mission) -> Iterator[dict[str, Any]]:
+    """Yield the rows of mission number j."""
+    n_run = len(mission.bounds)
+    first = 0 if mission.path else 1
+    for k in range(first, max(len(mission.path), n_run + 1)):
+        for i, robot in enumerate(mission.robots):
+            row: dict[str, Any] = dict(zip(KEYS, (j, k, robot), strict=True))
+            if mission.path:
+                row["row"], row["col"], row[POSTS] = (*mission.stations[k], POST_SETS[0])[:3]
+            if 1 <= k <= n_run:
+                bound = mission.bounds[k - 1]
+                row |= {name: getattr(bound, name)[i] for name in RATES}
+                row["status"] = mission.status if k == n_run else bound.status
+                row[BEGIN] = mission.began + bound.t0
+                row |= dict(zip(mission.features, bound.awareness[i], strict=True))
+            yield row
 
 
 def read_table(
@@ -118,7 +127,8 @@ def read_table(
     unit of the column's last decimal.
 
     With a workspace, positions may stand for cells: `x` and `y` in metres, `lon` and `lat` in
-    degrees, or `place`, the name of a place. Times `begin` and `end` may stand for `duration`.
+    degrees, or `place`, the name of a place. Times `begin` and `end`, in seconds or as dates, may
+    stand for `duration`. Times `begin` since 1970 also say when the mission began.
 
     Args:
         table: Path of a CSV file (commas, semicolons or tabs), a DataFrame, or a mapping of lists.
@@ -201,6 +211,8 @@ def _parsed(columns: Columns, features: Sequence[str]) -> pd.DataFrame:
     for name in features:
         numbers = columns.numbers(name, required=False, hint=f"; {_FURTHER}")
         values[name] = without_rounding(numbers) if is_mapped else numbers
+
+    values[BEGIN] = columns.numbers(BEGIN, required=False)
 
     _refuse_shares_outside(columns, "contact_rate", values["contact_rate"], "divide percent by 100")
     if is_mapped:
@@ -291,7 +303,7 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
     arrays = values.loc[expected].to_numpy(float).reshape(n_run, len(robots), -1)
     rate, duration, n_ticks = np.moveaxis(arrays[..., : len(RATES)], -1, 0)
 
-    return Mission.from_arrays(
+    mission = Mission.from_arrays(
         [*cells[["row", "col", POSTS]].itertuples(index=False, name=None)] if is_mapped else None,
         arrays[..., len(RATES) :],
         rate,
@@ -301,3 +313,9 @@ def _mission(rows: pd.DataFrame, features: Sequence[str], robots: tuple[str, ...
         features=features,
         robots=robots,
     )
+    begins = rows.loc[rows["bound"].between(1, n_run)].groupby("bound")[BEGIN].min().to_numpy()
+    if np.isnan(begins).any():
+        return mission
+
+    starts = (begins - begins[0]).tolist()
+    return replace(mission, starts=tuple(starts), began=began_at(begins[0]))

@@ -1,12 +1,13 @@
 """Conversion of poses and detections to missions in which all robots watch one lead."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from trustbo.data import STATUSES, Mission, Station, cells_of, stations_of
+from trustbo.data import STATUSES, Mission, Station, began_at, cells_of, stations_of
 from trustbo.errors import TrustboError, require_choice, require_positive, warn
 from trustbo.logs.crossings import crossings_of
 from trustbo.logs.detections import (
@@ -146,7 +147,9 @@ def read_tracks(
 
         of_lead = pairs.loc[pairs["lead"] == name]
         if len(edges) > 1 and len(of_lead):
-            missions.append(_mission(of_lead, edges, tick, cells, team, workspace, outcome))
+            mission = _mission(of_lead, edges, tick, cells, team, workspace, outcome)
+            began = began_at(t.min() + edges[0] * tick)
+            missions.append(replace(mission, began=began))
 
     if not missions:
         usual = tracks.sort_values("t").groupby("robot")["t"].diff().median()
