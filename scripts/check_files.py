@@ -29,7 +29,7 @@ KINDS = {
     ".ci": {""},
     "benchmarks": {".csv", ".md", ".py", ".toml"},
     "docs": {".bib", ".css", ".md", ".png", ".py", ".rst"},
-    "examples": {".py"},
+    "examples": {".py", ".sh", ".toml", ".txt"},
     "notebooks": {".ipynb"},
     "scripts": {".py", ".sh"},
     "src": {".html", ".md", ".py", ".pyi", ".tif", ".typed"},

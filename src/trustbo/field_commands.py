@@ -199,8 +199,11 @@ def _missions_in(args: Namespace, workspace: "Workspace", plan: "Plan | None") -
 
 def _print_last(campaign: "Campaign") -> None:
     """Print what the last mission measured."""
+    from trustbo.campaign.state import bounds_planned
+
     row = campaign.table().iloc[-1]
-    n_planned = len(campaign.missions[-1].path) - 1
+    last = campaign.state.entries[-1]
+    n_planned = bounds_planned(last.measured, last.plan.path)
     print(
         f"mission {len(campaign.missions)}: {row['start']} to {row['goal']}, {row['status']}, "
         f"{row['contact_lost']:.2f} of {n_planned} bounds of contact lost ({row['state']})"

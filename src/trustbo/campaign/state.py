@@ -151,9 +151,7 @@ class Exclusion(NamedTuple):
 
 def measures_of(mission: Mission, path: Sequence[Station]) -> dict[str, Any]:
     """Return what a mission measured on a planned path, by column of `Result.table`."""
-    n_planned = len(mission.path) - 1
-    if mission.path[-1] != path[-1][:2]:  # the path no longer contained the goal
-        n_planned = max(n_planned, len(path) - 1)
+    n_planned = bounds_planned(mission, path)
     rates = mission.contact_rate
     failed = [cell for _, cell, _ in incomplete_bounds(mission)]
     contact = float(np.nanmean(rates)) if np.isfinite(rates).any() else np.nan
@@ -173,6 +171,14 @@ def measures_of(mission: Mission, path: Sequence[Station]) -> dict[str, Any]:
         **({"posts": " ".join(post_sets)} if post_sets else {}),
         **({} if np.isnan(mission.began) else {"began": date_of(mission.began)}),
     }
+
+
+def bounds_planned(mission: Mission, path: Sequence[Station]) -> int:
+    """Return the number of bounds of a mission that followed a planned path."""
+    n_planned = len(mission.path) - 1
+    if mission.path[-1] != path[-1][:2]:  # the path no longer contained the goal
+        n_planned = max(n_planned, len(path) - 1)
+    return n_planned
 
 
 def failed_bounds_text(mission: Mission) -> str:

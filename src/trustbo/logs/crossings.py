@@ -5,28 +5,23 @@ subteam closes up in between. Where the lead halts, it is in the cell of the sto
 if its position lies beyond the edge of the cell.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from operator import itemgetter
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
-from scipy.spatial.distance import cdist
 
 from trustbo.data import Cell, Station, cells_of, require_path
 from trustbo.errors import TrustboError, warn
 from trustbo.logs.poses import GAP, UNITS
+from trustbo.logs.positions import cells_near, reach_of_stops, stops_of
 from trustbo.workspace import Workspace
 
 _SHORT = 10.0
 """Length of a log below which its unit of time is doubted, s."""
-_AT_STOP = 5.0
-"""Largest distance of a lead that is at a stop, m."""
-_OF_SIDE = 0.25
-"""The same in small cells, as a part of the shorter side of a cell."""
 _THROUGH = 0.5
 """Length of a visit, as a part of this side, from which it is not only a corner that is cut."""
 _SLOW = 2.0
@@ -130,39 +125,21 @@ class _Lead:
     Attributes:
         ticks: Numbers of these ticks, (pose,).
         xy: Positions, (pose, 2), m.
-        cells: Cell of each pose, or None off the grid; see `_located` and `_without_excursions`.
+        cells: Cell of each pose, or None off the grid; see `cells_near` and `_without_excursions`.
     """
 
     def __init__(self, places: pd.DataFrame, tick: float, workspace: Workspace) -> None:
         grid = self._grid = workspace.grid
         self._side = min(grid.cell_height, grid.cell_width)
-        self._radius = min(_AT_STOP, _OF_SIDE * self._side)
+        self._radius = reach_of_stops(workspace)
         self._most = GAP / tick  # number of ticks of an excursion
         self._drive_out = self._radius / (workspace.team.lead.speed * tick)  # at full speed, ticks
-        self._stop: Callable[[Cell], Any] = (
-            grid.center if workspace.posts is None else workspace.posts.stop
-        )
+        self._stop = stops_of(workspace)
 
         self.ticks = places["tick"].to_numpy()
         self.xy = places[["x", "y"]].to_numpy()
-        self.cells = _without_excursions(self.ticks.tolist(), self._located(), self._most)
-
-    def _located(self) -> list[Cell | None]:
-        """Return the cell of the nearest stop if the lead is there, or else the cell around it."""
-        row, col, is_on_grid = self._grid.cells_at(*self.xy.T)
-        around = np.stack([row, col], axis=1)
-        cells = np.where(is_on_grid[:, None], around, -1)
-        for r, c in np.unique(around, axis=0).tolist():
-            first = max(r - 1, 0), max(c - 1, 0)
-            block = np.ones(self._grid.shape)[first[0] : r + 2, first[1] : c + 2]
-            near = np.argwhere(block) + first
-            stops = [self._stop((i, j)) for i, j in near.tolist()]
-
-            in_cell = np.flatnonzero((around == (r, c)).all(axis=1))
-            away = cdist(self.xy[in_cell], stops)
-            at_stop = away.min(axis=1) <= self._radius
-            cells[in_cell[at_stop]] = near[away.argmin(axis=1)[at_stop]]
-        return [None if i < 0 else (i, j) for i, j in cells.tolist()]
+        located = [None if i < 0 else (i, j) for i, j in cells_near(workspace, self.xy).tolist()]
+        self.cells = _without_excursions(self.ticks.tolist(), located, self._most)
 
     def entered(self, since: int = 0) -> list[tuple[int, Cell]]:
         """Return the tick and the cell of each pose on the grid from a tick on."""

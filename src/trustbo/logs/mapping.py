@@ -39,6 +39,8 @@ _FACTORS = {
 _DATE = "date"
 _UNITS = (*_FACTORS, _DATE)
 _KEYS = ("column", "unit", "zone")
+_OF_TRACKS = ("t", "heading", "watcher", "seen", "detected")
+"""Names that only tables of poses and of detections have."""
 
 
 def read_columns(file: FilePath) -> dict[str, dict[str, str]]:
@@ -78,6 +80,12 @@ def require_columns(columns: object) -> dict[str, dict[str, str]]:
             f"of the table; got {one_line(columns)}."
         )
     return {str(name): _required(str(name), column) for name, column in columns.items()}
+
+
+def of_bounds(columns: ColumnMap) -> dict[str, dict[str, str]]:
+    """Return a mapping for a table of bounds, without the columns of poses and detections."""
+    given = require_columns(columns)
+    return {name: one for name, one in given.items() if name not in _OF_TRACKS}
 
 
 def _required(name: str, value: Any) -> dict[str, str]:

@@ -21,7 +21,7 @@ from trustbo.data import (
 )
 from trustbo.errors import TrustboError
 from trustbo.logs.columns import Columns, folded, require_one_spelling, require_plain_names
-from trustbo.logs.mapping import ColumnMap
+from trustbo.logs.mapping import ColumnMap, of_bounds
 from trustbo.logs.positions import with_cells, with_durations
 from trustbo.stacking import require_same_team
 from trustbo.workspace import Workspace
@@ -127,15 +127,16 @@ def read_table(
     unit of the column's last decimal.
 
     With a workspace, positions may stand for cells: `x` and `y` in metres, `lon` and `lat` in
-    degrees, or `place`, the name of a place. Times `begin` and `end`, in seconds or as dates, may
-    stand for `duration`. Times `begin` since 1970 also say when the mission began.
+    degrees, or `place`, the name of a place. A position within 5 m of a stop (in small cells, a
+    quarter of a side) is in the cell of this stop. Times `begin` and `end`, in seconds or as dates,
+    may stand for `duration`. Times `begin` since 1970 also say when the mission began.
 
     Args:
         table: Path of a CSV file (commas, semicolons or tabs), a DataFrame, or a mapping of lists.
         columns: Names of the table's columns, keyed by the names above. A value is a name, or has
             `column`, `unit` (%, s, ms, us, ns, min, h, m, cm, km, ft, or date) and, for dates,
             `zone`, such as `"America/Los_Angeles"`; the default zone is UTC. Other columns of the
-            table are then ignored.
+            table are then ignored, and so are names that only `read_tracks` knows, such as `t`.
         workspace: Map of the cells in which positions lie.
         path: Planned path, such as `campaign.ask().path`, whose first cell is the start of missions
             with bounds that are numbered from 1.
@@ -154,7 +155,7 @@ def read_table(
         >>> missions = tb.logs.read_table("legs.csv", columns=columns)
         >>> posterior = tb.fit(missions, workspace=workspace)
     """
-    given = Columns(table, columns=columns)
+    given = Columns(table, columns=None if columns is None else of_bounds(columns))
     with_cells(given, workspace)
     with_durations(given)
     known = [given.find(name) for name in (*COLUMNS, *TRUST)]
