@@ -45,3 +45,26 @@ def test_missions_of_several_files_and_folders_are_read_in_their_order(tmp_path)
     write_missions(tmp_path / "others.nc", told[::-1])
     read = read_missions([tmp_path / "others.nc", str(tmp_path / "campaign")])
     assert [mission.contact_rate[0, 0] for mission in read] == [0.75, 0.5, 0.25, 0.25, 0.5, 0.75]
+
+
+@pytest.mark.parametrize(
+    "copy",
+    [
+        "0002.sync-conflict-20260401-100237-ABCDEFG.nc", "0001 (1).nc", "0001 - Copy.nc",
+        "0001_conflict-20260401.nc", "1.nc", "0001-LAPTOP.nc", "00\u0661\u0662.nc",
+    ],
+)  # fmt: skip
+def test_copies_of_sync_programs_are_left_out_with_a_warning(tmp_path, copy):
+    told = [
+        Mission.from_arrays([(2, 0), (1, 1)], np.ones((1, 2, 3)), np.full((1, 2), rate))
+        for rate in (0.25, 0.5)
+    ]
+    for name, mission in (("0001.nc", told[0]), ("10000.nc", told[1]), (copy, told[1])):
+        write_missions(tmp_path / "missions" / name, [mission])
+    (tmp_path / "missions/.tmp-12ab.nc").touch()
+
+    with pytest.warns(UserWarning, match="left out") as warned:
+        assert_same_missions(read_missions(tmp_path), told)
+    assert len(warned) == 1
+    assert copy in str(warned[0].message)
+    assert_same_missions(read_missions(tmp_path / "missions" / copy), told[1:])

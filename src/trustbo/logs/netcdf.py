@@ -1,19 +1,24 @@
 """Missions in netCDF files, stored as consecutive bounds with the ticks of the robots."""
 
+import re
 from collections.abc import Iterable, Sequence
 from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from trustbo.data import POST_SETS, Mission, Sighting, cells_of
-from trustbo.errors import TrustboError
+from trustbo.display import joined
+from trustbo.errors import TrustboError, warn
 from trustbo.files import FilePath, interpreting, read_file, to_path, write_file
 from trustbo.stacking import require_same_team
 
 _ARRAYS = {"awareness": "1", "contact_rate": "1", "duration": "s", "n_ticks": "1"}
 """Arrays of a bound, (robot,) or (robot, feature), and their units."""
+_NUMBERED = re.compile(r"[0-9]{4,}\.nc")
+"""Names of the files of missions in the folder of a campaign."""
 _TEXTS = ("status", "scale", "map")
 """Texts of a mission."""
 
@@ -68,7 +73,9 @@ def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
     """Read missions, as measured.
 
     Args:
-        path: File, folder of a campaign, or a list of these, which are read in order.
+        path: File, folder of a campaign, or a list of these, which are read in order. In a folder,
+            files with other names than campaigns write, such as copies of sync programs, are left
+            out with a warning.
 
     Raises:
         TrustboError: A file does not exist, is damaged, or contains no missions.
@@ -83,7 +90,7 @@ def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
         paths = [path]
     files = []
     for place in map(to_path, paths):
-        files += sorted(place.glob("missions/[0-9]*.nc")) or [place]
+        files += _files_of_missions(place) or [place]
 
     missions = []
     for file in files:
@@ -91,6 +98,19 @@ def read_missions(path: FilePath | Sequence[FilePath]) -> list[Mission]:
         with interpreting(file):
             missions += missions_from_tree(tree)
     return missions
+
+
+def _files_of_missions(folder: Path) -> list[Path]:
+    """Return the files of missions in the folder of a campaign; warn of files with other names."""
+    found = sorted(folder.glob("missions/[!.]*.nc"))
+    files = [file for file in found if _NUMBERED.fullmatch(file.name)]
+    others = [file for file in found if file not in files]
+    if others:
+        warn(
+            f"left out {joined([file.name for file in others])} in {str(others[0].parent)!r}, as "
+            "missions have names such as '0001.nc'; give the paths of these files to read them."
+        )
+    return sorted(files, key=lambda file: int(file.stem))
 
 
 def missions_to_tree(missions: Iterable[Mission]) -> xr.DataTree:
