@@ -3,10 +3,12 @@
 import hashlib
 import json
 import os
+import re
 import secrets
 import signal
 import stat
 import threading
+import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, is_dataclass
@@ -26,6 +28,25 @@ _SIDE_FILES = (
     ".vat.dbf", ".vat.cpg",
 )  # fmt: skip
 """What GDAL and GIS append to the name of a raster to store its statistics, overviews and mask."""
+
+
+_NAME = re.compile(r"[A-Za-z0-9_\x80-\U0010ffff]([^\x00-\x1f/\x7f]*[^\x00-\x20/\x7f])?")
+"""Names of variables and dims that netCDF accepts."""
+_LONGEST_NAME = 120
+"""Largest number of bytes of a name. NetCDF reads 255, and dims may be made of two names."""
+
+
+def is_storable(name: str) -> bool:
+    """Return whether a variable or dim of a netCDF file can have a name, and keeps it.
+
+    NetCDF changes names that are not in the normal form NFC of Unicode.
+    """
+    try:
+        n_bytes = len(name.encode())
+    except UnicodeEncodeError:
+        return False
+    is_kept = unicodedata.is_normalized("NFC", name)
+    return is_kept and n_bytes <= _LONGEST_NAME and _NAME.fullmatch(name) is not None
 
 
 def to_path(path: FilePath) -> Path:

@@ -6,14 +6,17 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+import xarray as xr
 from jax import lax
 from numpyro import handlers
 from numpyro.contrib.control_flow import cond, scan
 
 import trustbo as tb
+from trustbo.files import is_storable
 from trustbo.inference.functions.checks import require_fittable
 from trustbo.inference.functions.data import data_of
 from trustbo.inference.functions.known import as_model
+from trustbo.logs.netcdf import read_tree, write_tree
 from trustbo.models import ContactRate
 from trustbo.models.observations import Observations
 
@@ -519,3 +522,46 @@ def test_contact_rates_with_obs_mask_are_refused(missions):
 
     with pytest.raises(tb.TrustboError, match=r"the site 'contact_rate' .* obs_mask"):
         check(missions, model)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["%w", ".w", "w ", " w", "/w", "w\n", "w\tx", "(w)", "", "w\0", "w\x7f", "\u212b", "w" * 121],
+)
+@pytest.mark.parametrize("role", ["site", "deterministic", "plate", "dim"])
+def test_names_that_files_cannot_store_are_refused(name, role, missions, tmp_path):
+    def own(awareness, contact_rate=None):
+        site = name if role == "site" else "weight"
+        event_dims = [name] if role == "dim" else ["level"]
+        weight = numpyro.sample(
+            site, dist.Normal(0.3, 0.3).expand([2]).to_event(1), infer={"event_dims": event_dims}
+        )
+        if role == "deterministic":
+            numpyro.deterministic(name, weight[0])
+        if role == "plate":
+            with numpyro.plate(name, 2):
+                numpyro.sample("other", dist.Normal())
+        rates(weight[0] * awareness[..., 0], contact_rate)
+
+    workspace = tb.Workspace.from_awareness(np.full((3, 3, 3, 1), 0.5))
+    with pytest.raises(tb.TrustboError, match="store"):
+        check(missions, own)
+    with pytest.raises(tb.TrustboError, match="store"):
+        tb.Campaign(workspace, (2, 0), (0, 2), model=own, directory=tmp_path / "campaign")
+    assert not (tmp_path / "campaign").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["w", "_w", "1 w", "größe", "weight of sight", "w.x", "w%", "net/w", "a/b/c", "w" * 120]
+)
+def test_names_that_files_can_store_are_accepted_and_stored(name, missions, tmp_path):
+    def own(awareness, contact_rate=None):
+        weight = numpyro.sample(name, dist.Normal(0.3, 0.3))
+        rates(weight * awareness[..., 0], contact_rate)
+
+    check(missions, own)
+    stored = name.replace("/", ".")
+    assert is_storable(stored)
+    tree = xr.DataTree(xr.Dataset({stored: ("x", [1.0, 2.0]), "y": (stored, [1.0])}))
+    write_tree(tmp_path / "a.nc", tree)
+    assert read_tree(tmp_path / "a.nc").identical(tree)

@@ -4,7 +4,6 @@ Overwatch involves two cells, so awareness is defined for each bound, that is, f
 into the cell. The awareness of a cell applies to all moves into the cell.
 """
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -13,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled, without_rounding
 from trustbo.data import POST_SETS, is_line_of_sight
-from trustbo.errors import TrustboError, require_kind, require_order
+from trustbo.errors import TrustboError, one_line, require_kind, require_order
+from trustbo.files import is_storable
 from trustbo.team import Team
 from trustbo.terrain import FEATURES, CompositeIndex
 from trustbo.terrain.features import pixel_feature
@@ -31,8 +31,6 @@ _AXES = (
 )
 _RESERVED = ("passable", "x", "y", "spatial_ref")
 """Names of other variables in the dataset of pixels."""
-_STORABLE = re.compile(r"\w([^/\x00-\x1f\x7f]*[^/\x00-\x1f\x7f\s])?")
-"""Names that variables of a netCDF file can have."""
 
 
 def pixel_maps(
@@ -60,10 +58,10 @@ def pixel_maps(
         require_kind("name of a feature", name, str, remedy)
         if is_line_of_sight(name) or name in _RESERVED:
             raise TrustboError(f"feature name {name!r} is reserved; choose another name.")
-        if not _STORABLE.fullmatch(name):
+        if not is_storable(name):
             raise TrustboError(
-                f"feature name {name!r} cannot be stored in a file; begin with a letter or a "
-                "digit, and use no '/'."
+                f"feature name {one_line(name)} cannot be stored in a netCDF file; begin with a "
+                "letter or a digit, end without a space, and use no '/' or control characters."
             )
 
     def values_of(name: str) -> np.ndarray:

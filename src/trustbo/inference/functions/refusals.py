@@ -1,6 +1,6 @@
 """What a NumPyro function must be, so that it can be sampled and stored: checks of its trace."""
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,10 +14,11 @@ from numpyro.distributions import (
 )
 
 from trustbo.display import joined
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, one_line
+from trustbo.files import is_storable
 from trustbo.inference.functions.data import RATES, Data
 from trustbo.inference.functions.explain import wrong_drift
-from trustbo.inference.functions.sites import has_prior, safe
+from trustbo.inference.functions.sites import has_prior, plates_of_rates, safe
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.scores import NOISES
 
@@ -113,6 +114,7 @@ def _require_contact_rate(who: str, rates: Any) -> ContactRate:
 def _require_variables(who: str, trace: Mapping[str, Any]) -> None:
     """Raise TrustboError for sites whose kind or name is not allowed in a posterior."""
     taken: dict[str, str] = {}
+    missions = plates_of_rates(trace)
     for name, one in trace.items():
         free = one["type"] == "sample" and not one["is_observed"]
         named = free or one["type"] == "deterministic"
@@ -132,6 +134,8 @@ def _require_variables(who: str, trace: Mapping[str, Any]) -> None:
                 f"the site {name!r} of {who} has the name of an axis of "
                 "posteriors; give it another name."
             )
+        if named:
+            _require_storable(who, one, missions)
         if named and taken.setdefault(safe(name), name) != name:
             raise TrustboError(
                 f"the sites {taken[safe(name)]!r} and {name!r} of {who} would have "
@@ -142,6 +146,22 @@ def _require_variables(who: str, trace: Mapping[str, Any]) -> None:
                 f"the site {name!r} of {who} is a parameter to optimise "
                 "(numpyro.param, flax_module), which NUTS leaves at its initial value; use "
                 "numpyro.sample or random_flax_module."
+            )
+
+
+def _require_storable(who: str, site: Mapping[str, Any], missions: Container[str]) -> None:
+    """Raise TrustboError if a file could not store the name of a site, or of one of its axes.
+
+    Plates of `missions` have the name of the axis of missions in a posterior.
+    """
+    plates = [frame.name for frame in site["cond_indep_stack"] if frame.name not in missions]
+    event_dims = (site.get("infer") or {}).get("event_dims") or []
+    for name in (site["name"], *plates, *map(str, event_dims)):
+        if not is_storable(safe(name)):
+            raise TrustboError(
+                f"{who} has a site, plate or dim with the name {one_line(name)}, which netCDF "
+                "files cannot store; begin with a letter or digit, end without a space, and use at "
+                "most 120 bytes without control characters."
             )
 
 
