@@ -13,9 +13,9 @@ from worlds import ModelSimulator, unequal_robots
 import trustbo as tb
 from trustbo.campaign.folder import MemoryStorage
 from trustbo.errors import TrustboError
+from trustbo.identity import map_name
 from trustbo.models import CoupledTrust, HierarchicalTrust, PlaceEffect, RobotEffect, default_model
 from trustbo.workspace import Workspace
-from trustbo.workspace.identity import map_name
 
 OPTIONS = {"sampler": "importance", "fit": {"draws": 60}}
 OTHER_ENDS = ((0, 0), (2, 2))

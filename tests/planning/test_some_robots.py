@@ -13,6 +13,7 @@ from worlds import hillside
 
 import trustbo as tb
 from trustbo.errors import TrustboError
+from trustbo.identity import map_name
 from trustbo.inference import TrustFilter, params_of
 from trustbo.inference.learner import learner_of, next_mission_of
 from trustbo.models import (
@@ -26,7 +27,6 @@ from trustbo.models import (
 )
 from trustbo.planning import Planner
 from trustbo.planning.plan import plan_from_record, plan_to_record
-from trustbo.workspace.identity import map_name
 from trustbo.workspace.netcdf import workspace_from_tree, workspace_to_tree
 
 ENDS = (4, 0), (0, 4)

@@ -15,10 +15,11 @@ import pytest
 
 import trustbo as tb
 from trustbo.errors import TrustboError
+from trustbo.identity import fingerprint
 from trustbo.models.backend import VERSIONS
 from trustbo.simulation import Truth
 from trustbo.study import Scene, run_grid
-from trustbo.study.grid import _hash_of as hash_of
+from trustbo.study.grid import _PARTS as PARTS
 
 POOLED = tb.models.PooledTrust()
 CASES = {"greedy": {"model": POOLED}, "random": {"model": POOLED, "policy": "random"}}
@@ -102,11 +103,11 @@ def test_earlier_campaigns_count_as_their_missions():
     where = scene(0)
     with tb.Campaign(where.workspace, (2, 0), (0, 2), model=POOLED) as campaign:
         for _ in campaign.run(where.simulator, 1):
-            before = hash_of("own", {"earlier": [campaign]})
+            before = fingerprint({"earlier": [campaign]}, PARTS)
             campaign.planner  # noqa: B018  (which the campaign keeps)
-            assert hash_of("own", {"earlier": [campaign]}) == before
+            assert fingerprint({"earlier": [campaign]}, PARTS) == before
         campaign.tell(where.simulator.run(campaign.ask().path, seed=1))
-        assert hash_of("own", {"earlier": [campaign]}) != before
+        assert fingerprint({"earlier": [campaign]}, PARTS) != before
 
 
 def test_values_that_no_other_process_can_get_are_refused(tmp_path):

@@ -8,8 +8,8 @@ from enumeration import every_path, paths_of, value_of
 from worlds import hillside, random_cells
 
 import trustbo as tb
+from trustbo.identity import map_name
 from trustbo.models import TrustParams
-from trustbo.workspace.identity import map_name
 from trustbo.workspace.netcdf import workspace_from_tree, workspace_to_tree
 
 ENDS = (3, 0), (0, 3)

@@ -7,8 +7,8 @@ import pytest
 from worlds import hillside, random_cells
 
 import trustbo as tb
+from trustbo.identity import map_name
 from trustbo.simulation import KinematicSimulator
-from trustbo.workspace.identity import map_name
 
 CAMP, HILL = (2, 0), (0, 2)
 

@@ -20,9 +20,9 @@ from trustbo.data import Mission
 from trustbo.display import joined
 from trustbo.errors import TrustboError, require_list
 from trustbo.hazard.trials import LostMission
+from trustbo.identity import map_name
 from trustbo.stacking import names_of_all, pooled
 from trustbo.workspace import Workspace
-from trustbo.workspace.identity import map_name
 
 _REMEDY = "give a result or campaign, or a list of them"
 

@@ -16,9 +16,10 @@ from trustbo.errors import (
     require_switch,
     require_whole,
 )
+from trustbo.identity import fingerprint
 from trustbo.simulation.events import Event
 from trustbo.simulation.motion import drive_together
-from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
+from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.simulation.sensing import Drive, contact_of, detections, new_tracks
 from trustbo.simulation.world import World, true_surface
 from trustbo.team import Robot, Team
@@ -127,7 +128,7 @@ class KinematicSimulator(DescribedSimulator):
         """Return the settings that affect the measurements of a mission."""
         same_team = self.team == self.workspace.team
         terrain = self.terrain
-        rasters = () if terrain is None else (terrain[n].values for n in ("y", "x", "dem", "dsm"))
+        rasters = [] if terrain is None else [terrain[n].values for n in ("y", "x", "dem", "dsm")]
         return {
             "simulator": type(self).__name__,
             "sight": dataclasses.asdict(self.sight),
@@ -135,7 +136,7 @@ class KinematicSimulator(DescribedSimulator):
             "bound_timeout": self.bound_timeout,
             "events": [repr(event) for event in self.events],
             "true_team": None if same_team else dataclasses.asdict(self.team),
-            "true_terrain": None if terrain is None else digest(*rasters),
+            "true_terrain": None if terrain is None else fingerprint(rasters),
         }
 
     def describe_world(self, mission: int) -> dict[str, object]:

@@ -9,10 +9,11 @@ from trustbo.arrays import read_labelled
 from trustbo.data import Cell, Mission, Station
 from trustbo.errors import TrustboError, require_kind, require_whole
 from trustbo.hazard.given import read_risk
+from trustbo.identity import fingerprint
 from trustbo.models import PooledTrust
 from trustbo.models.draws import Draws
 from trustbo.models.model import TrustModel
-from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
+from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.statespace import kalman
 from trustbo.streams import stream
 from trustbo.workspace import Workspace
@@ -135,7 +136,7 @@ class ModelSimulator(DescribedSimulator):
         if self.n_ticks is not None:
             about["n_ticks"] = self.n_ticks
         if not np.array_equal(self.awareness, self.workspace.awareness.values, equal_nan=True):
-            about["true_awareness"] = digest(self.awareness)
+            about["true_awareness"] = fingerprint(self.awareness)
         if self.p_fail is not None:
             about["p_fail"] = np.nan_to_num(self.p_fail, nan=-1.0).tolist()
         return about

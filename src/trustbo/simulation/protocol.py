@@ -1,12 +1,8 @@
 """Protocol for simulators, and a base class and functions that trustbo's simulators share."""
 
-import hashlib
 import inspect
 from collections.abc import Sequence
 from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import ArrayLike
 
 from trustbo import data
 from trustbo.data import Cell, Mission, Station
@@ -66,11 +62,3 @@ def require_path(
 def reads_post_sets(simulator: Any) -> bool:
     """Return whether a simulator's `run` has the argument `post_sets`."""
     return "post_sets" in inspect.signature(simulator.run).parameters
-
-
-def digest(*arrays: ArrayLike) -> str:
-    """Return a hash of the values of arrays, as 16 hexadecimal digits."""
-    found = hashlib.sha256()
-    for array in arrays:
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()[:16]

@@ -11,7 +11,8 @@ from scipy.stats import t as student
 
 from trustbo.data import Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
-from trustbo.simulation.protocol import DescribedSimulator, digest, require_path
+from trustbo.identity import fingerprint
+from trustbo.simulation.protocol import DescribedSimulator, require_path
 from trustbo.simulation.replicates import table_of
 from trustbo.simulation.world import true_terrain
 from trustbo.terrain import pixel_size
@@ -74,9 +75,9 @@ class RadioSimulator(DescribedSimulator):
         if terrain is None:
             raise TrustboError("the radio simulator needs a workspace made from a terrain.")
 
-        rasters = (terrain[name].values.astype(float) for name in ("y", "x", "dem", "dsm"))
+        rasters = [terrain[name].values.astype(float) for name in ("y", "x", "dem", "dsm")]
         self.workspace = workspace
-        self._terrain = digest(*rasters)
+        self._terrain = fingerprint(rasters)
         own = int(self._terrain[:8], 16)
         self.seed = own if seed is None else require_whole("seed", seed, 0)
         self.mean = _mean_contact(workspace, terrain, self.seed)

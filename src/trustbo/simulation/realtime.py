@@ -11,8 +11,9 @@ import numpy as np
 
 from trustbo.data import Bound, Cell, Mission
 from trustbo.errors import TrustboError, require_kind, require_whole
+from trustbo.identity import fingerprint
 from trustbo.simulation.kinematic import KinematicSimulator
-from trustbo.simulation.protocol import DescribedSimulator, digest
+from trustbo.simulation.protocol import DescribedSimulator
 from trustbo.simulation.world import World
 from trustbo.stacking import list_of_missions
 from trustbo.team import Robot
@@ -110,7 +111,7 @@ class RealtimeAwareness(DescribedSimulator):
         """Return the settings that affect the measurements of a mission."""
         fitted = [self.indices[feature].fitted for feature in SIGNS]
         numbers = [one[name].values for one in fitted for name in ("loading", "low", "high")]
-        return {**self.simulator.describe(), "realtime_awareness": digest(*numbers)}
+        return {**self.simulator.describe(), "realtime_awareness": fingerprint(numbers)}
 
     def describe_world(self, mission: int) -> dict[str, object]:
         """Return the settings of a mission's world, which are equal for equal worlds."""

@@ -18,10 +18,11 @@ from trustbo.display import Rows, Summary, announced
 from trustbo.errors import TrustboError, require_count, require_switch, require_whole
 from trustbo.files import FilePath, to_json, to_path, write_file
 from trustbo.fixed import fix
+from trustbo.identity import fingerprint
 from trustbo.models.backend import VERSIONS
 from trustbo.planning.paths import AdmissiblePaths, NoPathError
 from trustbo.simulation.model import ModelSimulator
-from trustbo.simulation.protocol import digest, require_path
+from trustbo.simulation.protocol import require_path
 from trustbo.simulation.replicates import replicated
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -222,7 +223,7 @@ def _known(workspace: Workspace) -> list[object]:
             arrays += [maps[name].values for name in ("y", "x", *maps.data_vars)]
 
     version = VERSIONS["trustbo"]
-    return [version, digest(*arrays), workspace.grid, workspace.team, workspace.sight]
+    return [version, fingerprint(arrays), workspace.grid, workspace.team, workspace.sight]
 
 
 def _cached(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset]) -> xr.Dataset:
@@ -230,7 +231,7 @@ def _cached(folder: FilePath | None, world: str, make: Callable[[], xr.Dataset])
     if folder is None:
         return make()
 
-    file = to_path(folder) / f"truth-{digest(np.frombuffer(world.encode(), np.uint8))}.nc"
+    file = to_path(folder) / f"truth-{fingerprint(world)}.nc"
     if not file.exists():
         # In memory, because the netCDF library keeps a file open if the disk is full.
         write_file(file, bytes(make().to_netcdf(engine="netcdf4")))

@@ -29,7 +29,7 @@ from trustbo.errors import (
     require_whole,
 )
 from trustbo.files import FilePath, interpreting, to_path, write_text
-from trustbo.inference.functions.identity import fingerprint
+from trustbo.identity import fingerprint
 from trustbo.models.backend import VERSIONS
 from trustbo.simulation import Truth
 from trustbo.simulation.protocol import Simulator
@@ -37,6 +37,8 @@ from trustbo.workspace import Workspace
 
 _N_SHOWN = 3
 """Number of runs whose errors the message contains."""
+_PARTS = {Result: lambda result: result.missions}
+"""What identifies an earlier campaign in a case: its missions."""
 
 
 class Scene(NamedTuple):
@@ -104,8 +106,8 @@ def run_grid(
     Each run writes a CSV file whose name contains the case, scene, seed and number of missions, and
     which records the version of trustbo and hashes of the case and of the function of the scene. A
     run is skipped if its file exists; if the version or a hash differs, `run_grid` raises an error.
-    Hashes cover values and the user's functions and classes, but neither files nor functions that
-    are called as attributes of a module; use another folder after such changes.
+    Hashes cover values, the user's functions and classes, and the versions of libraries, but no
+    files; use another folder if these change.
 
     Runs are parallelised with joblib, in new processes that see the present code and working
     directory. `joblib.parallel_config` selects another backend, such as `backend="dask"` for a
@@ -145,8 +147,10 @@ def run_grid(
     scenes = _named("scenes", scenes)
     seeds = _seeds_of(seeds)
     # Here and not in a worker process, so that a hash does not depend on how its code was sent.
-    of_cases = {name: _hash_of(name, case) for name, case in cases.items()}
-    of_scenes = {name: _hash_of(name, scene) for name, scene in scenes.items()}
+    of_cases, of_scenes = (
+        {name: fingerprint((name, one), _PARTS) for name, one in named.items()}
+        for named in (cases, scenes)
+    )
 
     root = to_path(folder)
     runs = []
@@ -213,11 +217,6 @@ def _seeds_of(seeds: Any) -> list[int]:
         require_whole(f"seeds[{k}]", seed, 0)
         for k, seed in enumerate(require_list("seeds", seeds, remedy=remedy))
     ]
-
-
-def _hash_of(name: str, value: Any) -> str:
-    """Return a hash of a named case or scene; earlier campaigns count as their missions."""
-    return fingerprint((name, value), {Result: lambda result: result.missions})
 
 
 def _plain(name: str) -> str:

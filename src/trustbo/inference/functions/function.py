@@ -22,9 +22,9 @@ from numpyro.primitives import Messenger, sample
 
 from trustbo.display import joined
 from trustbo.errors import TrustboError, warn
+from trustbo.identity import fingerprint, name_of, record_of
 from trustbo.inference.functions.data import NAMES, RATES, Data, FeatureNames, arrays_of
 from trustbo.inference.functions.explain import explained
-from trustbo.inference.functions.identity import constants_of, fingerprint, name_of
 from trustbo.inference.functions.plates import WholePlates
 from trustbo.inference.functions.refusals import base_of, require_rates
 from trustbo.inference.functions.sites import (
@@ -140,13 +140,8 @@ class FunctionModel:
         return f"the function {self.name}"
 
     def record(self) -> dict[str, Any]:
-        """Return the name and hash of the function, and the hashes of its constants, for files."""
-        return {
-            "class": KIND,
-            "name": self.name,
-            "sha256": self.fingerprint,
-            "constants": constants_of(self.function),
-        }
+        """Return the name of the function and what identifies it, for files."""
+        return {"class": KIND, "name": self.name, **record_of(self.function)}
 
     @cached_property
     def text(self) -> str:

@@ -10,6 +10,8 @@ from trustbo.inference.functions.function import KIND, FunctionModel
 
 _MOST_KNOWN = 64
 """Number of functions that are remembered, together with their compiled code."""
+_OF_RECORD = "constants", "versions"
+"""Entries of a record of a function that are compared by name."""
 _KNOWN: OrderedDict[str, FunctionModel] = OrderedDict()
 """Models of functions by fingerprint, with the most recently used model last."""
 
@@ -60,17 +62,24 @@ def model_of_record(
 
 
 def _difference(model: FunctionModel, record: Mapping[str, Any]) -> str:
-    """State which constants of a function differ from those in a record, or that the code does."""
+    """State which constants or versions differ from those in a record, or that the code does."""
     if model.name != record["name"]:
         return ""
 
-    own = model.record()["constants"]
-    stored = record.get("constants", {})
-    names = sorted(name for name in {**own, **stored} if own.get(name) != stored.get(name))
+    names, libraries = (_names_of_changed(model.record(), record, of) for of in _OF_RECORD)
+    if libraries and not names:
+        return f", as the versions of {joined(libraries)} differ"
     if not names:
         return ", whose code or use of functools.partial differs"
     is_are = "constant" if len(names) == 1 else "constants"
     return f", whose {is_are} {joined(names)} differ{'s' if len(names) == 1 else ''}"
+
+
+def _names_of_changed(own: Mapping[str, Any], stored: Mapping[str, Any], of: str) -> list[str]:
+    """Return the names of the constants or versions that differ between two records."""
+    values = own[of], stored.get(of, {})
+    names = sorted({**values[0], **values[1]})
+    return [name for name in names if values[0].get(name) != values[1].get(name)]
 
 
 def is_of_function(record: Mapping[str, Any]) -> bool:

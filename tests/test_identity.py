@@ -1,13 +1,15 @@
 """Hashes of functions, cases and scenes: what changes them, and what does not."""
 
-import io
+import json
 import os
 import subprocess
 import sys
 import threading
-from contextlib import redirect_stdout
 from functools import cached_property, lru_cache, partial
+from pathlib import Path
 
+import cloudpickle
+import identities
 import jax
 import jax.numpy as jnp
 import numba
@@ -18,7 +20,7 @@ import pytest
 from numpyro.handlers import reparam
 
 import trustbo as tb
-from trustbo.inference.functions.identity import constants_of, fingerprint
+from trustbo.identity import fingerprint, record_of
 from trustbo.inference.functions.known import as_model
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 
@@ -207,10 +209,10 @@ def test_constants_are_those_of_all_functions_that_are_called():
     def outer(awareness, contact_rate=None):
         return helper(awareness)
 
-    before = constants_of(outer)
+    before = record_of(outer)["constants"]
     assert set(before) == {"contact_rate", "scale", "GLOBAL"}
     helper.__defaults__ = (3.0,)
-    after = constants_of(outer)
+    after = record_of(outer)["constants"]
     assert [name for name in before if before[name] != after[name]] == ["scale"]
 
 
@@ -364,34 +366,123 @@ def test_globals_that_change_change_the_fingerprint(monkeypatch):
     assert as_model(with_global_prior) is not model  # not what was compiled with the old prior
 
 
-def test_a_fingerprint_is_the_same_in_other_processes():
-    """Of a function without source, of sets, and of texts in arrays, whatever the hash seed is."""
-    script = (
-        "from types import SimpleNamespace\n"
-        "from trustbo.inference.functions.identity import fingerprint as f\n"
-        "space = {}\n"
-        "made = 'def m(awareness, contact_rate=None): return (lambda x: x)(1)'\n"
-        "exec(compile(made, '<made>', 'exec'), space)\n"
-        "names = {'slope', 'openness', 'roughness', 'sight'}\n"
-        "settings = SimpleNamespace(names=names)\n"
-        "class Own:\n"
-        "    names = frozenset({'tri', 'sight', 'slope'})\n"
-        "    used = property(lambda self: names)\n"
-        "def closed(v): return lambda awareness, contact_rate=None: v\n"
-        "literal = lambda awareness, contact_rate=None: awareness in {'slope', 'tri', 'sight'}\n"
-        "import numpy as np\n"
-        "texts = [np.array(['slope', text], dtype=object) for text in ('tri', 'sight')]\n"
-        "print(f(space['m']), f(closed(names)), f(closed(settings)), f(literal),"
-        " f(closed({*names, 'tri'})), f({'policy': Own(), 'names': Own.names}),"
-        " *(f(closed(one)) for one in texts))"
+def test_many_kinds_of_functions_are_told_apart_in_all_processes():
+    """Before and after use, and made anew; and variants with another value are others."""
+    command = [sys.executable, "-W", "ignore", str(Path(identities.__file__))]
+    runs = []
+    for seed in ("1", "2"):
+        space = os.environ | {"PYTHONHASHSEED": seed}
+        run = subprocess.run(command, capture_output=True, text=True, check=True, env=space)
+        runs.append(json.loads(run.stdout.splitlines()[-1]))
+
+    first, second = runs
+    assert len(first) >= 80
+    for name, (before, after, anew, variant) in first.items():
+        assert before == after == anew != variant, name
+        assert second[name] == first[name], name
+    assert len({before for before, *_ in first.values()}) >= len(first) - 2  # norm and its partials
+
+
+SOURCE = """
+def own(x, scale=2.0):
+    def inner(y):
+        return y + scale
+    total = inner(x) * (x + scale) - (x if x > 1.0 else scale)
+    try:
+        return total / x
+    except ZeroDivisionError:
+        return helper(total, scale)
+def helper(x, y):
+    return x * y + 0.5
+"""
+
+
+def compiled(source, name="own", file="<made>"):
+    space = {"__name__": "mine"}
+    exec(compile(source, file, "exec"), space)
+    return space[name]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("def own(x, scale=2.0):", "def own(x: float, scale: float = 2.0) -> float:"),
+        ("def own(x, scale=2.0):", 'def own(x, scale=2.0):\n    """Text."""'),
+        ("        return y + scale", '        "Text."\n        return y + scale'),
+        ("def inner(y):", "def inner(y: 'float' = None or 1.0) -> dict[str, float]:"),
+        ("def inner(y):", "def inner(y: float) -> list[int]:"),
+        ("total = inner(x)", "total: float = inner(x)"),
+        ("inner(x) * (x + scale)", "inner(\n        x  # comment\n    ) * (x +\n  scale)"),
+        ("return helper(total, scale)", "return helper(\n            total,\n  scale,\n  )"),
+        ("def helper(x, y):", 'def helper(x: int, y: "int"):\n    "Text."\n\n'),
+        ("\ndef own", "\n\n\n# Comment\n\ndef own"),
+        ("0.5", "0.50"),
+        ("    try:", "    pass\n    try:"),
+    ],
+)
+def test_annotations_docstrings_and_layout_do_not_count(old, new):
+    assert old in SOURCE
+    changed = SOURCE.replace(old, new)
+    if "None or" in new:  # a default, which counts
+        assert fingerprint(compiled(changed)) != fingerprint(compiled(SOURCE))
+    else:
+        assert fingerprint(compiled(changed, file="<other>")) == fingerprint(compiled(SOURCE))
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("x > 1.0", "x >= 1.0"), ("y + scale", "y - scale"), ("ZeroDivisionError", "ValueError"),
+        ("(total, scale)", "(scale, total)"), ("(total, scale)", "(total, y=scale)"),
+        ("x * y + 0.5", "x * y + 0.25"), ("(x, scale=2.0)", "(x, *, scale=2.0)"),
+        ("(x, scale=2.0)", "(x, scale=2)"), ("def helper(x, y)", "def helper(y, x)"),
+        ("total / x", "total // x"), ("        return total / x", "        return -total / x"),
+        ("def own(x, scale", "def own(x, *others, scale"),
+    ],
+)  # fmt: skip
+def test_code_counts(old, new):
+    assert old in SOURCE
+    assert fingerprint(compiled(SOURCE.replace(old, new))) != fingerprint(compiled(SOURCE))
+
+
+def test_a_debugger_and_specialised_code_do_not_count():
+    function = compiled(SOURCE)
+    before = fingerprint(function)
+    for _ in range(100):
+        function(2.0)
+    traced = sys.gettrace()
+    sys.settrace(lambda *_: None)
+    function(2.0)
+    sys.settrace(traced)
+    assert fingerprint(compiled(SOURCE)) == before == fingerprint(function)
+
+
+def test_sharing_order_and_memory_do_not_count():
+    array = np.arange(12.0).reshape(3, 4)
+    shared = [array, array]
+    assert fingerprint(shared) == fingerprint([array.copy(), np.asfortranarray(array)])
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+    one, other = closed(1.0), closed(1.0)
+    assert fingerprint([one, one]) == fingerprint([one, other])
+    assert fingerprint([one, one]) == fingerprint(
+        cloudpickle.loads(cloudpickle.dumps([one, other]))
     )
-    with redirect_stdout(io.StringIO()) as here:
-        exec(script, {"__name__": "__main__"})
-    space = os.environ | {"PYTHONHASHSEED": "1"}  # it is 0 here
-    command = [sys.executable, "-c", script]
-    there = subprocess.run(command, capture_output=True, text=True, check=True, env=space).stdout
-    assert here.getvalue() == there
-    assert len({*there.split()}) == 8
+    assert fingerprint([array, array]) != fingerprint([array, array[::-1]])
+    assert fingerprint(np.arange(3)) != fingerprint(np.arange(3.0))
+    assert fingerprint([1, 2]) != fingerprint((1, 2)) != fingerprint([[1], 2])
+
+
+def test_the_versions_of_libraries_count_and_are_recorded(monkeypatch):
+    def function(x):
+        return jnp.tanh(x)
+
+    before = record_of(function)
+    python = f"{sys.version_info.major}.{sys.version_info.minor}"
+    assert before["versions"] == {"python": python, "jax": jax.__version__}
+    monkeypatch.setattr("trustbo.identity._installed", lambda library: "0.0")
+    after = record_of(function)
+    assert after["sha256"] != before["sha256"]
+    assert after["versions"]["jax"] == "0.0"
 
 
 def test_a_fingerprint_tells_random_keys_apart():
