@@ -16,6 +16,7 @@ from functools import cached_property, lru_cache, partial, singledispatch, wraps
 from pathlib import Path
 from typing import NamedTuple
 
+import cloudpickle
 import jax
 import jax.numpy as jnp
 import numba
@@ -413,13 +414,25 @@ def use(function):
         str(part)
 
 
+def sent(function):
+    """Return a function as another process gets it; some cannot be sent."""
+    try:
+        return cloudpickle.loads(cloudpickle.dumps(function))
+    except (AttributeError, TypeError):
+        return function
+
+
 def hashes():
-    """Return [before use, after use, made anew, with another k] of each function, by name."""
+    """Return the hashes of each function, by name.
+
+    These are before and after use, as a worker gets it, made anew, and with another k.
+    """
     made = functions(2.0)
     found = {name: [fingerprint(one)] for name, one in made.items()}
     for name, one in made.items():
         use(one)
         found[name].append(fingerprint(one))
+        found[name].append(fingerprint(sent(one)))
     for k in (2.0, 3.0):
         for name, one in functions(k).items():
             found[name].append(fingerprint(one))

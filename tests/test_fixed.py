@@ -13,6 +13,7 @@ from worlds import unequal_robots
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.fixed import fix
+from trustbo.identity import fingerprint
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +129,41 @@ def test_the_pickle_of_a_mission_is_the_same_before_and_after_use(mission):
     assert fresh.stations == fresh.path
     assert repr(fresh)
     assert joblib.hash(fresh) == before
+
+
+def use(workspace, plan, planner):
+    """Compute what workspaces, plans and planners keep."""
+    params = tb.models.TrustParams(0.6, np.full(len(workspace.features), 0.1), 0.0, 0.1, 0.1)
+    planner.plan(params)
+    workspace.difficulty.whole()
+    workspace.of_robots(workspace.team.names[:1])
+    workspace.passable.attrs  # noqa: B018  (xarray makes it when it is asked for)
+    for one in (workspace, plan):
+        assert repr(one)
+        assert one._repr_html_()
+    assert plan.routes is not None
+    assert plan.posts is not None
+
+
+def test_hashes_of_workspaces_plans_and_planners_are_those_before_use(workspace, plan):
+    things = workspace, plan, tb.Planner(workspace, (2, 0), (0, 3))
+    fresh = pickle.loads(pickle.dumps(things))
+    before = [(joblib.hash(one), fingerprint(one)) for one in fresh]
+    use(*fresh)
+    assert [(joblib.hash(one), fingerprint(one)) for one in fresh] == before
+    again = pickle.loads(pickle.dumps(fresh))
+    assert [(joblib.hash(one), fingerprint(one)) for one in again] == before
+    assert [fingerprint(one) for one in things] == [hashed for _, hashed in before]
+
+
+def test_the_fingerprint_of_a_posterior_is_that_before_use(mission):
+    posterior = tb.fit([mission] * 2, check=False, progress=False)
+    before = fingerprint(posterior)
+    assert repr(posterior)
+    assert posterior["posterior"]["b"].mean().item()
+    assert fingerprint(posterior.copy(deep=True)) == before == fingerprint(posterior)
+    posterior["posterior"]["b"][0, 0] += 1.0
+    assert fingerprint(posterior) != before
 
 
 def test_trust_maps_and_truths_can_be_changed_without_effect(workspace):

@@ -377,8 +377,9 @@ def test_many_kinds_of_functions_are_told_apart_in_all_processes():
 
     first, second = runs
     assert len(first) >= 80
-    for name, (before, after, anew, variant) in first.items():
+    for name, (before, after, sent, anew, variant) in first.items():
         assert before == after == anew != variant, name
+        assert sent == before, name
         assert second[name] == first[name], name
     assert len({before for before, *_ in first.values()}) >= len(first) - 2  # norm and its partials
 

@@ -5,6 +5,7 @@ name no remedy. Objects that hold fixed values derive from `Fixed`.
 """
 
 import dataclasses
+from functools import cached_property
 from typing import Any, ClassVar, NoReturn
 
 import numpy as np
@@ -54,6 +55,10 @@ class FixedArray(xr.DataArray):
             )
         super().__setitem__(key, value)
 
+    def __reduce__(self) -> Any:
+        """Without what xarray fills in when the array is used."""
+        return _array_from, (self.to_dict(data="array"),)
+
 
 class FixedMaps(xr.Dataset):
     """Dataset of a workspace, whose variables cannot be replaced; copies of it can be changed."""
@@ -74,6 +79,10 @@ class FixedMaps(xr.Dataset):
     def update(self, other: Any) -> NoReturn:
         """Refuse the change."""
         self._refuse()
+
+    def __reduce__(self) -> Any:
+        """Without what xarray fills in when the maps are used."""
+        return _maps_from, (self.to_dict(data="array"), dict(self.encoding))
 
     def _refuse(self) -> NoReturn:
         raise TrustboError(
@@ -149,6 +158,38 @@ def _maps_of(maps: xr.Dataset) -> xr.Dataset:
     fixed = FixedMaps(variables, maps.coords, maps.attrs)
     fixed.encoding = maps.encoding
     return fixed
+
+
+def _array_from(parts: dict[str, Any]) -> xr.DataArray:
+    """Return a read-only DataArray from its pickle."""
+    return _array_of(xr.DataArray.from_dict(parts))
+
+
+def _maps_from(parts: dict[str, Any], encoding: dict[str, Any]) -> xr.Dataset:
+    """Return a read-only Dataset from its pickle."""
+    maps = xr.Dataset.from_dict(parts)
+    maps.encoding = encoding
+    return _maps_of(maps)
+
+
+def cached_names(kind: type, *kinds: type) -> set[str]:
+    """Return the names of cached properties of a class, also those of other `kinds`."""
+    return {
+        name
+        for base in kind.__mro__
+        for name, one in vars(base).items()
+        if isinstance(one, (cached_property, *kinds))
+    }
+
+
+class Uncached:
+    """Base class of objects whose pickles leave out what cached properties have computed."""
+
+    __slots__ = ()
+
+    def __getstate__(self) -> dict[str, Any]:
+        cached = cached_names(type(self))
+        return {name: value for name, value in vars(self).items() if name not in cached}
 
 
 class Fixed:

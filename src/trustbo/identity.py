@@ -10,6 +10,7 @@ import functools
 import hashlib
 import importlib
 import inspect
+import random
 import sys
 import weakref
 from collections.abc import Callable, Mapping
@@ -35,6 +36,7 @@ from scipy import sparse
 
 from trustbo.bytecode import imports_of, parts_of, reads_of
 from trustbo.data import THREAT
+from trustbo.fixed import cached_names
 
 _HASH_LENGTH = 16
 """Number of hexadecimal digits of a hash; two are equal by chance with probability 1e-19."""
@@ -42,11 +44,13 @@ _SHORT = 8
 """Number of hexadecimal digits of the hash of a constant."""
 _ATOMS = (type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented))
 """Kinds of values whose text says all."""
+_JITTED: Any = type(jax.jit(len))
+"""Class of what `jax.jit` returns."""
 _CACHES = (
     *weakref.ProxyTypes, weakref.ref, weakref.WeakKeyDictionary, weakref.WeakValueDictionary,
-    weakref.WeakSet,
+    weakref.WeakSet, np.random.RandomState, random.Random,
 )  # fmt: skip
-"""Kinds of objects that change when others are used, and that count by their class."""
+"""Kinds of objects that change when they are used, and that count by their class."""
 
 
 def fingerprint(value: Any, parts: Mapping[type, Callable[[Any], Any]] | None = None) -> str:
@@ -191,6 +195,9 @@ class _Hasher:
             if isinstance(value, kind):
                 return f"part of {kind.__name__}", part_of(value)
 
+        if isinstance(value, _JITTED):  # which forgets its attributes in other processes
+            state = value.__getstate__()
+            return "jitted", (state["fun"], state["static_argnames"])
         if name := _library_name(value):
             return "of a library", (name, self._version_of(name))
         if inspect.ismodule(value):
@@ -212,7 +219,7 @@ class _Hasher:
         if isinstance(value, Dispatcher):  # of numba, whose attributes are changed by a call
             return "compiled", (value.py_func, value.targetoptions)
         if isinstance(value, DUFunc | GUFunc):
-            return "compiled", value.__wrapped__  # pyright: ignore[reportAttributeAccessIssue]
+            return "vectorised", value._dispatcher  # pyright: ignore[reportAttributeAccessIssue]
         if isinstance(value, np.vectorize):
             return "vectorised", (value.pyfunc, value.otypes, value.excluded, value.signature)
         if _is_wrapper(value):
@@ -311,10 +318,7 @@ def _is_of_user(module: str | None) -> bool:
 
 
 def _library_name(value: Any) -> str:
-    """Return the module and name under which a library has a value; "" if it has no such name.
-
-    Objects such as `scipy.stats.norm` are looked up in the module of their class.
-    """
+    """Return the module and name under which a library has a value; "" if it has no such name."""
     try:
         module, name = value.__module__, value.__qualname__
         is_named = isinstance(module, str) and not _is_of_user(module)
@@ -322,13 +326,7 @@ def _library_name(value: Any) -> str:
             return f"{module}.{name}"
     except (AttributeError, KeyError, TypeError):
         pass
-
-    kind = type(value)
-    if kind.__module__ == "builtins" or _is_of_user(kind.__module__):
-        return ""
-    space = vars(sys.modules.get(kind.__module__, ModuleType("")))
-    names = sorted(name for name, one in [*space.items()] if one is value)
-    return f"{kind.__module__}.{names[0]}" if names else ""
+    return ""
 
 
 def _imported(name: str, level: int, package: str) -> Any:
@@ -405,6 +403,8 @@ def _content_of_table(value: Any) -> tuple[str, Any] | None:
         return "objects", (value.shape, value.tolist())
     if isinstance(value, xr.DataArray | xr.Dataset):  # without the accessors used so far
         return "xarray", value.to_dict(data="array")
+    if isinstance(value, xr.DataTree):
+        return "tree", {group.path: group.to_dataset(inherit=False) for group in value.subtree}
     if isinstance(value, pd.DataFrame):  # whose columns are stored together once it is used
         return "table", [value.index, *(column for _, column in value.items())]
     if isinstance(value, sparse.sparray | sparse.spmatrix):
@@ -429,11 +429,6 @@ def _taken_apart(value: Any) -> tuple[str, Any]:
 
     make, arguments, state, items, pairs = (*reduced, None, None, None)[:5]
     if isinstance(state, dict):
-        cached = {
-            name
-            for base in kind.__mro__
-            for name, one in vars(base).items()
-            if isinstance(one, functools.cached_property | lazy_property)
-        }
-        state = {n: one for n, one in state.items() if n not in cached and n != "__doc__"}
+        left_out = {*cached_names(kind, lazy_property), "__doc__"}
+        state = {name: one for name, one in state.items() if name not in left_out}
     return "object", (make, arguments, state, [*(items or ())], [*(pairs or ())])

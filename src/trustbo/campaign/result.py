@@ -101,12 +101,11 @@ class Result(Summary):
         self._computed: dict[str, Any] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"_turn": None, "_bases": {}}  # a lock cannot be pickled
+        return vars(self) | {"_turn": None, "_bases": {}, "_computed": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._turn = threading.RLock()
-        self._computed = dict(self._computed)
 
     def _rows(self) -> Rows:
         state = self.state

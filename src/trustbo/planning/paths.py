@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from trustbo.data import POST_SETS, Cell, Station, path_text, require_path
 from trustbo.errors import TrustboError, one_line, require_kind, require_whole
+from trustbo.fixed import Uncached
 from trustbo.planning.unrolled import Committed, Unrolled, committed
 from trustbo.workspace import Workspace
 from trustbo.workspace.closed import closed_along, closed_text
@@ -54,7 +55,7 @@ class NoPathError(TrustboError, nx.NetworkXNoPath):
     """
 
 
-class AdmissiblePaths:
+class AdmissiblePaths(Uncached):
     """Admissible paths from a start to a goal.
 
     A path ends when it enters the goal, and has at least `shortest` and at most `longest` bounds.

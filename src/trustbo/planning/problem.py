@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Station, cells_of, path_text
 from trustbo.errors import TrustboError, require_kind, require_positive
+from trustbo.fixed import Uncached
 from trustbo.hazard.path_risk import ROUNDING, Risk
 from trustbo.inference.learner import next_mission_of
 from trustbo.models.draws import Draws, NextMission
@@ -68,7 +69,7 @@ class InfeasibleError(TrustboError):
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(Uncached):
     """Admissible paths, objective and costs of a planner; see `Planner` for their meaning.
 
     Attributes:

@@ -67,7 +67,8 @@ class CompositeIndex:
         for k, column in enumerate(columns):
             x[:, k] = column.ravel()[known]
         del known
-        low, high = np.transpose([np.percentile(column, _WINSORISED) for column in x.T])
+        limits = [np.percentile(column, _WINSORISED) for column in x.T]
+        low, high = np.transpose(limits).copy()
         np.clip(x, low, high, out=x)
 
         mean = x.mean(0)

@@ -28,7 +28,7 @@ import math
 from collections.abc import Iterable
 from copy import copy
 from functools import cache
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy import ndimage
@@ -49,6 +49,8 @@ SPACING = 2.0
 """Minimum distance between T2's robots, m."""
 RADIUS = 25.0
 """Maximum distance of T2 from the lead's stop, m."""
+_FOUND = "_stops", "_lines", "_posts"
+"""Attributes of `Posts` with what was found so far."""
 _STEP = 4.0  # spacing of the lattice of positions, m
 _STOP_RADIUS = 16.0  # search radius for the lead's stop, m
 _SMOOTHED = 5.0  # width of the moving average of traversability for stops, m
@@ -158,12 +160,22 @@ class Posts:
         self._views: dict[Cell, _View] = {}
         self._posts: dict[tuple[Cell, Cell | None, str], np.ndarray] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Include the posts, which take minutes on large grids, in an order of their own."""
+        found = {name: vars(self)[name] for name in _FOUND}
+        ordered = {
+            name: dict(sorted(one.items(), key=lambda item: str(item[0])))
+            for name, one in found.items()
+        }
+        return vars(self) | ordered | {"_views": {}}
+
     def of_robots(self, names: Iterable[str]) -> Self:
         """Return the stops, posts and routes of some robots, as planned for the whole team.
 
         Raises TrustboError if a name is unknown or repeated, or if there are no names.
         """
-        some = copy(self)  # which shares the stops and posts found so far
+        some = copy(self)
+        vars(some).update(vars(self))  # which shares the stops and posts found so far
         some.team = self.team.of_robots(names)
         some._members = [self._whole.names.index(name) for name in some.team.names]
         return some

@@ -49,6 +49,9 @@ class Routes:
         self._paces: dict[float, np.ndarray] = {}
         self._cached: dict[tuple[object, ...], np.ndarray] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_paces": {}, "_cached": {}}  # found again when needed
+
     def find(
         self, robot: Robot, start: np.ndarray, goal: np.ndarray, window: Window
     ) -> np.ndarray | None:
