@@ -51,13 +51,28 @@ def test_the_trust_of_the_goal_is_that_of_the_terminal_plan(workspace, beta0):
     assert float(planner.trust_map(params)[ENDS[1]]) == pytest.approx(last, rel=1e-12)
 
 
-def test_the_summary_and_the_cost_are_over_the_maps_of_draws(workspace):
+@pytest.mark.parametrize("model", [PooledTrust(), HierarchicalTrust()])
+def test_the_summary_and_the_cost_are_on_the_paths_that_are_best_in_the_mean(workspace, model):
+    draws = sample_prior(model, 2, 20, seed=1, n_robots=2)
+    planner = Planner(workspace, *ENDS)
+    summary = planner.maps(draws)
+    for row, col in np.argwhere(workspace.passable.values).tolist():
+        if (row, col) == planner.start:
+            continue
+        nearest = int(planner.problem.paths.to((row, col), 0).longest)
+        zs = [workspace.along(path)
+              for path in paths_of(planner, (row, col), longest=nearest + 2)]  # fmt: skip
+        of_mean = [trust_of_params(draws.mean(), z)[..., -1, :].mean() for z in zs]
+        trust = trust_of_params(draws, zs[int(np.argmax(of_mean))])[:, -1].mean(-1)
+        assert summary["trust_mean"].values[row, col] == pytest.approx(trust.mean(), rel=1e-9)
+        assert summary["trust_sd"].values[row, col] == pytest.approx(trust.std(), rel=1e-7)
+        cost = (1.0 / (1.0 + np.exp(trust))).mean()
+        assert summary["cost"].values[row, col] == pytest.approx(cost, rel=1e-9)
+
+
+def test_the_cost_of_a_draw_is_that_of_its_map(workspace):
     draws = sample_prior(PooledTrust(), 2, 50, seed=1)
     planner = Planner(workspace, *ENDS)
-    maps, summary = planner.trust_map(draws).values, planner.maps(draws)
-    np.testing.assert_allclose(summary["trust_mean"], maps.mean(0))
-    np.testing.assert_allclose(summary["trust_sd"], maps.std(0))
-    np.testing.assert_allclose(summary["cost"], (1.0 / (1.0 + np.exp(maps))).mean(0))
     cost = planner.cost_map(draws.draw(0))
     np.testing.assert_allclose(cost, 1.0 / (1.0 + np.exp(planner.trust_map(draws.draw(0)))))
 

@@ -763,7 +763,6 @@ class Result(Summary):
         """
         require_switch("expected", expected)
         if self.state.last is None:
-            # The largest trust of many paths would be far too high with unknown effects of places.
             prior = self.draw_prior(n_draws)
             ahead = NextMission(prior, prior)
         else:

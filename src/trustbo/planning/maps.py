@@ -17,7 +17,7 @@ def maps_of(
     draws = choose_draws(ahead.of_robots(expected=expected), n_draws, seed)
     of_plans = choose_draws(ahead.expected, n_draws, seed)
     workspace = problem.paths.workspace
-    trust = trust_map(problem, draws)
+    trust = trust_map(problem, draws, led=True)
     passable = workspace.passable
     try:
         share = drawn_paths(problem, of_plans).share()

@@ -649,8 +649,9 @@ class Planner(Summary):
         Returns:
             Dataset with dims (y, x), whose coordinates are the cell centres in CRS metres;
             `isel(y=row, x=col)` selects a cell. The accessor `.rio` has the CRS and writes rasters.
-            The maps are the mean `trust_mean` and standard deviation `trust_sd` of `trust_map`, the
-            mean `cost` of `cost_map`, the probability `path_probability` that a cell is on the best
+            The maps are the mean `trust_mean` and standard deviation `trust_sd` of trust on arrival
+            at each cell, and its mean `cost` (see `cost_map`), on the paths that are best under the
+            mean of the draws; the probability `path_probability` that a cell is on the best
             path (on the safest path if no path respects `max_failure`), and each feature, averaged
             over robots and moves (named `awareness_<name>` if the name is taken). With place
             effects, there are also their `place_mean` and `place_sd`. Impassable cells are NaN. The

@@ -10,25 +10,40 @@ from trustbo.models.draws import Draws
 from trustbo.planning.objectives import TERMINAL, weights_of
 from trustbo.planning.paths import SIMPLE_EXTRA, STEPS, AdmissiblePaths
 from trustbo.planning.problem import Problem
-from trustbo.planning.recursion import Recursion
+from trustbo.planning.recursion import Recursion, states_along
 from trustbo.planning.sums import best_sums
+from trustbo.workspace.moves import pairs_along
 
 
 def trust_map(
-    problem: Problem, params: Draws, *, per_robot: bool = False, x0: ArrayLike | None = None
+    problem: Problem,
+    params: Draws,
+    *,
+    per_robot: bool = False,
+    x0: ArrayLike | None = None,
+    led: bool = False,
 ) -> xr.DataArray:
-    """Compute the trust map with the axis (draw,); see `Planner.trust_map`."""
+    """Compute the trust map with the axis (draw,); see `Planner.trust_map`.
+
+    If `led`, all draws reach a cell on the path that is best under the mean of the draws. The mean
+    over draws is then what is expected, while that of largest values would be too high.
+    """
     recursion = problem.recursion(params, x0, by_robot=per_robot)
+    if led:
+        of_mean = problem.recursion(params.mean(), x0, by_robot=per_robot)
+        both = zip(of_mean, recursion, strict=True)
+        recursion = Recursion(*(np.concatenate(pair) for pair in both))
+
     like = problem.paths.workspace.awareness.isel(move=0, feature=0, drop=True)
     n_states = recursion.start.shape[-1]
-
     if per_robot:
-        robots = [_largest(problem.paths, recursion, of_one) for of_one in np.eye(n_states)]
+        robots = [_largest(problem.paths, recursion, of_one, led) for of_one in np.eye(n_states)]
         values = np.stack(robots, axis=1)
     else:
-        values = _largest(problem.paths, recursion, np.full(n_states, 1.0 / n_states))
+        values = _largest(problem.paths, recursion, np.full(n_states, 1.0 / n_states), led)
         like = like.isel(robot=0, drop=True)
 
+    values = values[int(led) :]
     trust = like.expand_dims(draw=len(values)).copy(data=values)
     start = path_text([problem.paths.start])  # cell in which trust is assumed; see `plots`
     return trust.rename("trust").assign_attrs(long_name="expected trust", start=start)
@@ -40,8 +55,13 @@ def cost_of(trust: xr.DataArray) -> xr.DataArray:
     return cost.assign_attrs(long_name="cost 1 - sigma(trust)")
 
 
-def _largest(paths: AdmissiblePaths, recursion: Recursion, state_weights: np.ndarray) -> np.ndarray:
-    """Compute the largest trust, state_weights . x, on arrival at each cell, (draw, row, col)."""
+def _largest(
+    paths: AdmissiblePaths, recursion: Recursion, state_weights: np.ndarray, led: bool
+) -> np.ndarray:
+    """Compute the largest trust, state_weights . x, on arrival at each cell, (draw, row, col).
+
+    If `led`, it is the trust on the path that is best under the first draw.
+    """
     extra = min(SIMPLE_EXTRA, paths.longest - paths.shortest)
 
     weights = state_weights @ recursion.transition  # (draw, state)
@@ -50,25 +70,54 @@ def _largest(paths: AdmissiblePaths, recursion: Recursion, state_weights: np.nda
     scalar = (weights == beta0.max(-1, keepdims=True) * state_weights).all()
     if scalar and (beta0 >= 0.0).all():
         drift = np.einsum("s,dsmrc->dmrc", state_weights, recursion.drift)
-        drift = drift.reshape(len(drift), -1, *paths.bounds.shape).max(1)  # of the best posts
-        drift = np.where(paths.bounds, drift, np.nan)
-        return best_trust(paths, extra, drift, beta0.max(-1), recursion.start @ state_weights)
+        sets = drift.reshape(len(drift), -1, *paths.bounds.shape).swapaxes(0, 1)
+        sets = np.where(paths.bounds, sets, -np.inf)
+        drift = _taken(sets, _chosen(sets, led))  # of the best posts
+        start = recursion.start @ state_weights
+        return best_trust(paths, extra, drift, beta0.max(-1), start, led=led)
 
     # Otherwise, search once for each cell.
     drift = recursion.drift.reshape(*recursion.start.shape, -1)
     values = np.full((len(drift), *paths.bounds.shape[1:]), np.nan)
     no_cost = np.zeros(drift.shape[-1])
     for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
-        graph = paths.to((row, col), extra).graph
+        graph_paths = paths.to((row, col), extra)
+        graph = graph_paths.graph
         weights = weights_of(TERMINAL, recursion, state_weights, graph.longest)
-        values[:, row, col], _ = best_sums(graph, drift, weights, no_cost)
+        scores, found = best_sums(graph, drift, weights, no_cost)
+        if led:
+            path = graph_paths.cells(found[0])
+            ways = pairs_along(path, paths.workspace.n_posts)[:, :3].T
+            along = recursion._replace(drift=recursion.drift[:, :, *ways])
+            scores = states_along(along)[:, -1] @ state_weights
+        values[:, row, col] = scores
 
     values[:, *paths.start] = recursion.start @ state_weights
     return values
 
 
+def _chosen(values: np.ndarray, led: bool) -> np.ndarray:
+    """Return the index on the first axis of the largest values, of each draw or of the first.
+
+    The values have the shape (choice, draw, ...).
+    """
+    best = values.argmax(0)
+    return np.broadcast_to(best[:1], best.shape) if led else best
+
+
+def _taken(values: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return the chosen values on the first axis."""
+    return np.take_along_axis(values, chosen[None], 0)[0]
+
+
 def best_trust(
-    paths: AdmissiblePaths, extra: int, drift: np.ndarray, beta0: np.ndarray, x0: np.ndarray
+    paths: AdmissiblePaths,
+    extra: int,
+    drift: np.ndarray,
+    beta0: np.ndarray,
+    x0: np.ndarray,
+    *,
+    led: bool = False,
 ) -> np.ndarray:
     """Find the largest trust on arrival at each cell, for beta0 >= 0; NaN if it is unreachable.
 
@@ -78,9 +127,11 @@ def best_trust(
     Args:
         paths: Admissible paths.
         extra: Number of bounds that a path to a cell may have beyond the shortest path.
-        drift: Drift of each bound, shape (draw, move, row, col); NaN where there is no bound.
+        drift: Drift of each bound, shape (draw, move, row, col); NaN or minus infinity where there
+            is no bound.
         beta0: Autoregressive coefficient, shape (draw,).
         x0: Trust at the start, shape (draw,).
+        led: Whether all draws take the paths that are best under the first draw.
 
     Returns:
         Largest trust, shape (draw, row, col).
@@ -110,10 +161,11 @@ def best_trust(
             entered[m] = carried + u[:, m]
         entered[:, :, k > reach] = -np.inf
 
-        by = entered.argmax(0)
-        top = np.take_along_axis(entered, by[None], 0)[0]
+        by = _chosen(entered, led)
+        top = _taken(entered, by)
         np.put_along_axis(entered, by[None], -np.inf, 0)
-        second = entered.max(0)
-        best = np.maximum(best, top)
+        second = _taken(entered, _chosen(entered, led))
+        of_all = np.stack([best, top])
+        best = _taken(of_all, _chosen(of_all, led))
 
     return np.where(np.isfinite(best), best, np.nan)[:, 1:-1, 1:-1]
