@@ -147,6 +147,11 @@ def imported_inside(x):
     from helpers_of_mine import scaled
     return scaled(x)
 
+def package_imported_inside(x):
+    from xml import dom
+    from package_of_mine import lower
+    return lower.scaled(x)
+
 def module_imported_inside(x):
     import helpers_of_mine as h
     return h.scaled(x)
@@ -312,8 +317,15 @@ def fitted(estimator, k):
 
 def by_source(k):
     """Return functions of a module that was written, or written anew and reloaded, with k."""
-    for name, text in (("helpers_of_mine", HELPERS), ("mine", CODE)):
-        Path(_FOLDER, f"{name}.py").write_text(text.format(k=k))
+    package = Path(_FOLDER, "package_of_mine")
+    package.mkdir(exist_ok=True)
+    (package / "__init__.py").touch()
+    for name, text in (
+        ("helpers_of_mine", HELPERS),
+        ("package_of_mine.lower", HELPERS),
+        ("mine", CODE),
+    ):
+        Path(_FOLDER, f"{name.replace('.', '/')}.py").write_text(text.format(k=k))
         importlib.invalidate_caches()
         module = importlib.import_module(name)
         importlib.reload(module)
@@ -439,8 +451,23 @@ def hashes():
     return found
 
 
+def hashes_of_edited_cells():
+    """Return the hashes of a function whose cell is run as it is, and with changes around it."""
+    cell = CELL.format(k=2.0)
+    plain = cell.replace("(x: float) -> float", "(x)").replace('"Documented."', "pass")
+    edited = (
+        f"%%time\n{cell}", f"%%capture\n{cell}", f"\n# Comment\n{cell}\nof_cell(1.0)",
+        cell.replace("import numpy as np\n", ""), plain,
+    )  # fmt: skip
+    found = []
+    for text in (cell, *edited):
+        InteractiveShell.instance().run_cell(text)
+        found.append(fingerprint(InteractiveShell.instance().user_ns["of_cell"]))
+    return found
+
+
 with tempfile.TemporaryDirectory() as _FOLDER:
     if __name__ == "__main__":
         sys.path.insert(0, _FOLDER)
         sys.dont_write_bytecode = True
-        sys.stdout.write(json.dumps(hashes()))
+        sys.stdout.write("\n" + json.dumps([hashes(), hashes_of_edited_cells()]))

@@ -18,8 +18,11 @@ _KINDS = (
     | inspect.CO_ASYNC_GENERATOR
 )  # fmt: skip
 """Flags of a code that change what a call does."""
-_IDLE = {"NOP", "RESUME", "CACHE", "EXTENDED_ARG"}
-"""Instructions without an effect."""
+_IDLE = {"NOP", "RESUME", "CACHE", "EXTENDED_ARG", "PUSH_NULL"}
+"""Instructions without an effect of their own.
+
+Whether PUSH_NULL comes with a call of an attribute depends on the other code of a module or cell.
+"""
 _CLOSURE = 8
 _ANNOTATIONS = 4 | 16
 """Flags of functions that are made with annotations; 16 is that of Python 3.14."""
@@ -64,11 +67,17 @@ def reads_of(code: CodeType) -> list[Read]:
     return sorted(found)
 
 
-def imports_of(code: CodeType) -> Iterator[tuple[str, int, tuple[str, ...]]]:
-    """Yield the imports in a code and its inner functions: name, level and names of attributes.
+class Import(NamedTuple):
+    """An import in a function: the module, the names from it, and all attributes that are read."""
 
-    Without a list of names, all attributes that the code reads are returned.
-    """
+    module: str
+    level: int
+    names: tuple[str, ...]
+    attributes: tuple[str, ...]
+
+
+def imports_of(code: CodeType) -> Iterator[Import]:
+    """Yield the imports in a code and its inner functions."""
     steps, _ = _steps_and_handlers(code)
     read = tuple(sorted({value for name, value in steps if name in _OF_ATTRIBUTES}))
     for k, (name, value) in enumerate(steps):
@@ -76,7 +85,7 @@ def imports_of(code: CodeType) -> Iterator[tuple[str, int, tuple[str, ...]]]:
             yield from imports_of(value)
         elif name == "IMPORT_NAME":
             (_, level), (_, names) = steps[k - 2 : k]
-            yield value, level, names or read
+            yield Import(value, level, names or (), read)
 
 
 def _attributes_after(steps: tuple[Step, ...], k: int) -> tuple[str, ...]:

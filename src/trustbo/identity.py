@@ -259,14 +259,12 @@ class _Hasher:
                 found[path] = value
 
         package = function.__globals__.get("__package__") or ""
-        for name, level, attributes in imports_of(function.__code__):
+        for name, level, names, attributes in imports_of(function.__code__):
             module = _imported(name, level, package)
-            if module is None:
-                continue
-            found[module.__name__] = module
-            for attribute in attributes:
-                if _is_of_user(module.__name__) and hasattr(module, attribute):
-                    found[f"{module.__name__}.{attribute}"] = getattr(module, attribute)
+            of_module = _attributes_of(module, names or attributes)
+            for one in list(of_module.values()):  # such as a module of a package
+                of_module |= _attributes_of(one, attributes)
+            found |= {name: module, **of_module}
         return found
 
     def _note(self, values: Mapping[str, Any]) -> None:
@@ -331,12 +329,20 @@ def _library_name(value: Any) -> str:
 
 def _imported(name: str, level: int, package: str) -> Any:
     """Return a module that a function imports, or None if it cannot be imported."""
-    with suppress(Exception):  # of many types: it is code of the user
+    with suppress(Exception):  # of many types, as this runs code of the user
         name = resolve_name("." * level + name, package) if level else name
         if _is_of_user(name):
             return importlib.import_module(name)
         return sys.modules.get(name) or ModuleType(name)  # libraries count by name and version
     return None
+
+
+def _attributes_of(module: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return attributes of a module of the user by name, without those that it does not have."""
+    if not inspect.ismodule(module) or not _is_of_user(module.__name__):
+        return {}
+    found = vars(module)
+    return {f"{module.__name__}.{name}": found[name] for name in names if name in found}
 
 
 def _followed(name: str, value: Any, attributes: tuple[str, ...]) -> tuple[str, Any]:
