@@ -21,7 +21,7 @@ from numpyro.handlers import reparam
 
 import trustbo as tb
 from trustbo.identity import fingerprint, record_of
-from trustbo.inference.functions.known import as_model
+from trustbo.inference.functions.known import as_model, model_of_record
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 
 CODE = """
@@ -485,6 +485,14 @@ def test_the_versions_of_libraries_count_and_are_recorded(monkeypatch):
     after = record_of(function)
     assert after["sha256"] != before["sha256"]
     assert after["versions"]["jax"] == "0.0"
+
+
+def test_a_refusal_names_the_versions_that_differ():
+    record = as_model(linear).record()
+    other = record | {"sha256": "0" * 16, "versions": record["versions"] | {"python": "3.99"}}
+    with pytest.raises(tb.TrustboError, match="python"):
+        model_of_record(other, linear)
+    assert model_of_record(record, linear) is as_model(linear)
 
 
 def test_a_fingerprint_tells_random_keys_apart():
