@@ -577,6 +577,18 @@ def test_a_subteam_that_fails_to_close_up_fails_the_bound_at_whose_stop_the_lead
     np.testing.assert_allclose(one.duration[:, 0], [20.0] * (n - 1) + [49.0], atol=1.0)
 
 
+@pytest.mark.parametrize("sd", [0.0, 0.5])
+def test_a_lead_that_waits_where_it_is_stuck_does_not_prolong_its_bound(field, sd):
+    poses, seen = (table[table.t < 50.0] for table in driven(field, PLANNED))
+    stands = poses.loc[poses.t == poses.t.max()]
+    poses = pd.concat([poses, *(stands.assign(t=stands.t + k) for k in range(1, 300))])
+    poses[["x", "y"]] += sd * np.random.default_rng(0).normal(size=(len(poses), 2))
+    with pytest.warns(UserWarning, match=r"detections by a, b end 30\d s before the poses"):
+        one = read_driven(field, poses, seen, status="stuck")
+    assert one.statuses == ["ok", "ok", "stuck"]
+    assert one.duration[2, 0] == pytest.approx(17.0, abs=2.0)  # 7 s of driving, and 10 s more
+
+
 def test_what_a_stuck_lead_does_after_it_left_its_way_is_not_measured(field):
     tables = driven(field, [(3, 0), (2, 1), (3, 2), (3, 3)])  # is towed away from (2, 1)
     with pytest.warns(UserWarning, match=r"\(1, 2\)"):

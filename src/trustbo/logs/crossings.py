@@ -26,6 +26,10 @@ _THROUGH = 0.5
 """Length of a visit, as a part of this side, from which it is not only a corner that is cut."""
 _SLOW = 2.0
 """Time in which the lead drives out of a circle, at most, as a multiple of that at full speed."""
+_STILL = 2.0
+"""Distance within which the positions of a lead that stands still lie, m."""
+_NOTICED = 10.0
+"""Time after which a team has noticed that the lead is stuck, s."""
 _FEW = 5
 """Number of readings below which a rate is hardly known."""
 
@@ -109,7 +113,8 @@ def crossings_of(
                 f"{end * tick:g} s after the start of the log; leave status= out, or end the poses "
                 "where the bound failed."
             )
-        edges.append(lead.end_of_visit(path[len(reached) - 1 :][:2], reached[-1], n))
+        left = lead.end_of_visit(path[len(reached) - 1 :][:2], reached[-1], n)
+        edges.append(lead.still_since(edges[-1], left, round(_NOTICED / tick)))
     elif is_failed or end == n:
         edges[-1] = n  # it is still there
 
@@ -235,6 +240,21 @@ class _Lead:
             if left is not None and k - left > self._most:
                 return left
         return n
+
+    def still_since(self, begin: int, end: int, noticed: int) -> int:
+        """Return the tick until which a lead that got stuck counts as on its way, at most `end`.
+
+        These are so many ticks after it has moved for the last time.
+        """
+        poses = self._between(begin, end)
+        if not len(poses):
+            return end
+
+        xy = self.xy[poses]
+        place = np.median(xy[-max(noticed, 1) :], axis=0)
+        moves = np.flatnonzero(np.linalg.norm(xy - place, axis=1) > _STILL)
+        stopped = self.ticks[poses[moves[-1]]] + 1 if len(moves) else begin
+        return min(end, int(stopped) + max(noticed, _FEW))
 
     def _between(self, begin: int, end: int) -> np.ndarray:
         """Return the positions of the poses from one tick until before another, (pose,)."""

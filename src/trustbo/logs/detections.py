@@ -43,6 +43,12 @@ _LEAST_REGULAR = 0.2
 """Mean resultant length of phases below which the phase of nearby detections is unknown."""
 _JUST_BEFORE = 0.02
 """Time before the start of a tick, in ticks, at which a reading still counts as at its start."""
+_OFTEN_SEEN = 20
+"""Number of detections from which the end of all detections is unusual."""
+_SILENCE = 60.0
+"""Time without any detection before the end of a log that is unusual, s."""
+_UNUSUAL = 5.0
+"""Such a time as a multiple of the longest time between two detections."""
 _LEAST_EXTENT = 0.1
 """Extent of all poses below which their unit is doubted, m."""
 
@@ -238,6 +244,26 @@ def warn_of_times(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) -> Non
         )
 
     _warn_of_intervals(looks, tick)
+
+
+def warn_of_silence(tracks: pd.DataFrame, looks: pd.DataFrame, leads: Sequence[str]) -> None:
+    """Warn of robots whose detections of the leads end long before their poses do."""
+    of_lead = looks.loc[looks["lead"].isin(leads)].sort_values("t")
+    ends = tracks.groupby("robot")["t"].max()
+    lead_ends = ends[[name for name in leads if name in ends.index]].max()
+    silent = {}
+    for name, t in of_lead.groupby("robot")["t"]:
+        silence = min(ends[name], lead_ends) - t.iloc[-1]
+        longest = t.diff().max()
+        if len(t) >= _OFTEN_SEEN and silence > max(_SILENCE, _UNUSUAL * longest):
+            silent[str(name)] = silence
+
+    if silent:
+        warn(
+            f"detections by {_listed(silent)} end {max(silent.values()):.0f} s before the poses, "
+            "which counts as lost contact; if a detector failed, give the log of the poses until "
+            "then, or leave out the poses of this robot afterwards."
+        )
 
 
 def warn_of_gaps(

@@ -15,6 +15,7 @@ from trustbo.logs.detections import (
     ticks_of,
     warn_of_gaps,
     warn_of_names,
+    warn_of_silence,
     warn_of_times,
 )
 from trustbo.logs.mapping import ColumnMap
@@ -83,7 +84,8 @@ def read_tracks(
         tick: Length of a tick, s.
         status: Why the mission ended before it was complete. If it is not `"aborted"`, the bound
             in which the poses end failed: the bound into the cell at whose stop the lead is, while
-            T2 closes up, or else the one on which it has left this stop.
+            T2 closes up, or else the one on which it has left this stop. This bound ends 10 s after
+            the lead has moved for the last time.
         columns: Names and units of the columns in both tables, as for `read_table`.
 
     Returns:
@@ -99,7 +101,8 @@ def read_tracks(
     Warns:
         UserWarning: A watcher is unknown, detections lie outside the time of the poses, the lead
             detects robots, the interval of detections is not the tick, poses are more than 5 s
-            apart, a robot has no poses, is never seen or never watches, the lead leaves the
+            apart, a robot has no poses, is never seen, never watches or stops watching long before
+            the end, the lead leaves the
             planned path or starts again after it, a bound has fewer than 5 readings, or T2 stood at
             the posts of no set, although the workspace has several and the path has none.
 
@@ -161,6 +164,7 @@ def read_tracks(
 
     warn_of_names(looks, unknown, leads, team, robots)
     warn_of_times(tracks, looks, tick)
+    warn_of_silence(tracks, looks, leads)
     warn_of_gaps(tracks, looks, pairs, leads)
     return missions
 
