@@ -85,6 +85,19 @@ def test_arrays_are_read_only_also_in_copies_and_pickles(of, again, workspace, p
         array[...] = 0
 
 
+def test_what_a_campaign_keeps_of_its_missions_is_read_only(workspace):
+    campaign = tb.Campaign(workspace, (2, 0), (0, 3))
+    truth = tb.models.TrustParams(0.6, np.array([0.3, 0.2, 0.1]), 0.05, 0.05, 0.05)
+    list(campaign.run(tb.simulation.ModelSimulator(workspace, truth), 1))
+    kept = (campaign.hazard["margin"], campaign.history["path"])
+    for array in kept:
+        with pytest.raises(ValueError, match=r"read-only|is a view"):
+            array[...] = 0.0
+    maps = campaign.maps(n_draws=5)
+    maps["trust_mean"][...] = 0.0  # made anew for each call
+    assert campaign.maps(n_draws=5)["trust_mean"].max() > 0.0
+
+
 def test_what_is_computed_from_a_workspace_can_be_changed(workspace):
     doubled = workspace.awareness * 2.0
     doubled[0] = 0.0

@@ -29,6 +29,18 @@ def mark(values: np.ndarray) -> np.ndarray:
     return values
 
 
+def marked[T](value: T) -> T:
+    """Mark the arrays of new maps of xarray as read-only, and return the maps; else the value."""
+    variables: list[Any] = []
+    if isinstance(value, xr.DataArray):
+        variables = [value]
+    elif isinstance(value, xr.Dataset):
+        variables = [*value.data_vars.values()]
+    for variable in variables:
+        mark(variable.values)
+    return value
+
+
 def _is_fixed(values: Any) -> bool:
     """Return whether an array and the arrays of which it is a view are read-only."""
     while isinstance(values, np.ndarray):

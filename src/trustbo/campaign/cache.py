@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from typing import Any, Self, overload
 
+from trustbo.fixed import marked
+
 
 class computed[T]:  # noqa: N801  (used as a decorator, like `property`)
-    """Property that is computed on first access, one thread at a time.
+    """Property that is computed on first access, one thread at a time; maps are read-only.
 
     The object needs two attributes: `_turn`, a reentrant lock between threads, and `_computed`, a
     dictionary of the values. To compute all properties again, clear this dictionary.
@@ -26,5 +28,5 @@ class computed[T]:  # noqa: N801  (used as a decorator, like `property`)
             return self
         with instance._turn:
             if self._name not in instance._computed:
-                instance._computed[self._name] = self._compute(instance)
+                instance._computed[self._name] = marked(self._compute(instance))
             return instance._computed[self._name]

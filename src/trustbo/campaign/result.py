@@ -28,6 +28,7 @@ from trustbo.errors import (
     require_switch,
 )
 from trustbo.files import FilePath
+from trustbo.fixed import marked
 from trustbo.hazard.risk import BoundRisk
 from trustbo.inference.learner import Learner
 from trustbo.inference.score import Posteriors
@@ -335,7 +336,7 @@ class Result(Summary):
         with self._turn:
             of_courses = self._computed.setdefault(name, {})
             if course not in of_courses:
-                of_courses[course] = compute()
+                of_courses[course] = marked(compute())
             return of_courses[course]
 
     def _shown(

@@ -21,7 +21,7 @@ from trustbo.data import (
 )
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import require_switch
-from trustbo.fixed import Fixed, mark
+from trustbo.fixed import Fixed, fixed_array, mark
 from trustbo.hazard.path_risk import PathRisk
 from trustbo.workspace import Workspace
 from trustbo.workspace.closed import closed_text
@@ -309,7 +309,10 @@ class Plan(Fixed, Summary):
 
         path = self.stations
         onward = [*path[2:], None]  # T2 moves to its posts for the bound to this cell
-        return tuple(map(posts.bound_routes, path, path[1:], onward))
+        routes = map(posts.bound_routes, path, path[1:], onward)
+        return tuple(
+            tuple(None if way is None else fixed_array(way) for way in ways) for ways in routes
+        )
 
 
 def sets_text(post_sets: Sequence[str]) -> str:
