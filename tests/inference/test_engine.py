@@ -10,7 +10,7 @@ from numpyro import handlers
 
 from trustbo.inference import engine
 from trustbo.inference.density import Density, at
-from trustbo.inference.gradient import log_density_and_slopes
+from trustbo.inference.nuts import log_density_and_slopes
 from trustbo.models.backend import own_settings
 from trustbo.models.visited import visited
 
@@ -120,11 +120,6 @@ def test_effects_of_a_bound_are_correlated_between_sets_of_posts(name):
     np.testing.assert_allclose(posterior.log_evidence(theta), dense(theta).log_density(), rtol=1e-9)
 
 
-def test_slopes_with_sets_of_posts_are_those_of_the_density():
-    posterior, *_ = posterior_with_posts(f"pooled, {EVERYTHING}")
-    require_equal_slopes(posterior)
-
-
 def require_equal_slopes(posterior):
     """Compare slopes at random scores with differences of the density."""
     z = 0.5 * np.random.default_rng(3).standard_normal((2, posterior.n_scores))
@@ -135,11 +130,6 @@ def require_equal_slopes(posterior):
     log_p, slopes = log_density_and_slopes(posterior, z)
     np.testing.assert_allclose(log_p, posterior.log_density(z), rtol=1e-12)
     np.testing.assert_allclose(slopes, np.array(differences) / 2e-4, rtol=1e-3, atol=1e-3)
-
-
-def test_slopes_with_places_on_other_maps_are_those_of_the_density():
-    posterior, *_ = posterior_on_maps(f"pooled, {EVERYTHING}")
-    require_equal_slopes(posterior)
 
 
 def test_first_missions_keep_their_maps():

@@ -2,7 +2,7 @@
 
 `Chains` samples any log density that has a gradient in JAX. `sample_by_nuts` samples the posterior
 of a model class. For Gaussian rates, coefficients and linear predictors are integrated out, and
-NUTS samples only the scores of the hyperparameters, with the density and the slopes of `gradient`.
+NUTS samples only the scores of the hyperparameters, with differences of the density as slopes.
 Chains start at points of the importance sampler, whose covariance is the mass matrix, so warm-up
 tunes only the step size. For other families, EP only approximates the evidence, so NUTS samples
 `model.program`, including coefficients and linear predictors.
@@ -27,12 +27,13 @@ from trustbo.errors import TrustboError
 from trustbo.inference import importance
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.diagnostics import FIELDS, complaints_of, statistics_of
-from trustbo.inference.gradient import log_density_and_slopes
 from trustbo.models.backend import own_settings
 from trustbo.streams import stream
 
 MOST_DENSE = 50
 """Largest number of coordinates for which the mass matrix is dense."""
+_STEP = 1e-5
+"""Step of the differences in slopes, in scores."""
 _CANDIDATES = 16
 """Number of candidates for the start of a chain; the first one with a density is chosen."""
 _SMALLEST = 1e-12
@@ -325,6 +326,24 @@ def sample_by_nuts(
     c = density.draw_coefficients(theta, rng) if density.is_gaussian else found["coefficients"]
     statistics = statistics_of({n: v.reshape(-1) for n, v in samples.fields.items()})
     return JointDraws(theta, c), statistics, summary, complaints
+
+
+def log_density_and_slopes(density: Density, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute `Density.log_density` (point,) and its derivatives (point, score) at scores z.
+
+    The derivatives are differences; NUTS samples the exact density for any approximation of them.
+    Where the density is 0, or its derivatives are not finite, both are those of density 0.
+    """
+    n, n_scores = z.shape
+    steps = _STEP * np.vstack([np.zeros(n_scores), np.eye(n_scores)])
+    near = (z[:, None] + steps).reshape(-1, n_scores)
+    values = density.log_density(near).reshape(n, -1)
+    with np.errstate(invalid="ignore"):  # differences of infinite values
+        slopes = (values[:, 1:] - values[:, :1]) / _STEP
+
+    is_finite = np.isfinite(values).all(1)
+    log_p = np.where(is_finite, values[:, 0], -np.inf)
+    return log_p, np.where(is_finite[:, None], slopes, 0.0)
 
 
 def _in_jax(density: Density) -> LogDensity:

@@ -171,17 +171,6 @@ class Factor(NamedTuple):
         _back(self.U, x, *order.layout)
         return plain(x[order.place].transpose(2, 1, 0))
 
-    def whitened(self, c: np.ndarray) -> np.ndarray:
-        """Compute whitened vectors F' c from vectors c (point, column)."""
-        order = self.order
-        x = plain(c.T[order.column])
-        _multiply(self.U, x, *order.layout)
-
-        white = plain(x.T)
-        dense = white[:, -order.n_dense :]
-        dense[:] = np.einsum("nij,nj->ni", np.triu(self.H), dense)
-        return white
-
     def covariance(self) -> np.ndarray:
         """Compute A^-1 (entry, point) at the stored entries, with halved diagonals."""
         order = self.order
@@ -389,31 +378,6 @@ def _back(
             for d in range(n_draws):
                 for p in range(n_points):
                     x[one, d, p] /= U[a + k, p]
-
-
-@kernel(fastmath={"contract"})
-def _multiply(
-    U: np.ndarray,
-    x: np.ndarray,
-    panel: np.ndarray,
-    first: np.ndarray,
-    start: np.ndarray,
-    pattern: np.ndarray,
-    row: np.ndarray,
-) -> None:
-    """Multiply U by x (place, point) in place, except for the rows of the last panel."""
-    n_points = U.shape[1]
-    for s in range(len(first) - 2):
-        r = start[s + 1] - start[s]
-        for k in range(first[s + 1] - first[s]):
-            one = first[s] + k
-            a = row[one]
-            for p in range(n_points):
-                x[one, p] *= U[a + k, p]
-            for j in range(k + 1, r):
-                other = pattern[start[s] + j]
-                for p in range(n_points):
-                    x[one, p] += U[a + j, p] * x[other, p]
 
 
 @kernel(fastmath={"contract"})
