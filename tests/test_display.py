@@ -138,3 +138,17 @@ def test_a_bar_is_shown_in_a_terminal_but_not_in_a_log(monkeypatch, is_terminal)
         assert hidden.disable
         assert shown.disable is not is_terminal
     assert ("missions" in stream.getvalue()) == is_terminal
+
+
+def test_a_campaign_without_progress_shows_none_of_what_it_calls(monkeypatch, capsys):
+    monkeypatch.setattr(display, "_PATIENCE", 0.0)
+    monkeypatch.setattr(display, "shows_bars", lambda: True)
+    terrain = tb.terrain.synthetic_terrain((90.0, 90.0), seed=5, relief=6.0)
+    workspace = tb.Workspace.from_terrain(terrain, (3, 3), n_posts=1)
+    for progress in (False, True):
+        display.say_once.cache_clear()
+        capsys.readouterr()
+        campaign = tb.Campaign(workspace, (2, 0), (0, 2), progress=progress)
+        campaign.ask()
+        assert ("difficulty of bounds" in capsys.readouterr().err) == progress
+        workspace = tb.Workspace.from_terrain(terrain, (3, 3), n_posts=1)

@@ -7,6 +7,7 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from typing import Any
 
@@ -19,6 +20,8 @@ Rows = list[tuple[str, str]]
 _WIDTH = 100
 _MAX_LINES = 3  # per property
 _PATIENCE = 1.5  # seconds of work before a progress bar or a line appears
+_wanted: ContextVar[bool] = ContextVar("wanted", default=True)
+"""Whether progress is shown; see `with_progress`."""
 
 
 class Summary:
@@ -72,6 +75,16 @@ def joined(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
+@contextmanager
+def with_progress(wanted: bool) -> Iterator[None]:
+    """Show progress in the block only if it is wanted."""
+    before = _wanted.set(_wanted.get() and wanted)
+    try:
+        yield
+    finally:
+        _wanted.reset(before)
+
+
 def slow_bar(name: str, unit: str, shown: bool, *, total: int | None = None) -> tqdm:
     """Make a progress bar that appears only if the work takes longer than `_PATIENCE`."""
     return bar(shown, desc=name, unit=unit, total=total, delay=_PATIENCE, leave=False)
@@ -81,7 +94,7 @@ def bar(shown: bool, **options: Any) -> tqdm:
     """Make a progress bar, unless nobody sees it; see `shows_bars`."""
     # tqdm reads sys.stderr also for a bar that it does not show.
     file = sys.stderr if _has_stderr() else io.StringIO()
-    return tqdm(disable=not (shown and shows_bars()), file=file, **options)
+    return tqdm(disable=not (shown and _wanted.get() and shows_bars()), file=file, **options)
 
 
 def shows_bars() -> bool:
@@ -125,6 +138,10 @@ def refreshing(shown: tqdm, step: int = 0) -> Iterator[None]:
 @contextmanager
 def announced(text: str) -> Iterator[None]:
     """Print a line if the block takes longer than `_PATIENCE`; each text is printed once."""
+    if not _wanted.get():
+        yield
+        return
+
     timer = threading.Timer(_PATIENCE, say_once, [text])
     timer.daemon = True
     timer.start()

@@ -27,7 +27,7 @@ from trustbo.campaign.simulated import require_simulator, run_missions, settings
 from trustbo.campaign.state import Entry, Failure, State
 from trustbo.campaign.stopping import Stop, require_stop
 from trustbo.data import Cell, Mission, cells_of, require_path
-from trustbo.display import joined, say
+from trustbo.display import joined, say, with_progress
 from trustbo.errors import (
     TrustboError,
     one_line,
@@ -233,7 +233,7 @@ class Campaign(Recorder):
             >>> plan.robots
             ('r1', 'r3')
         """
-        with self._turn:
+        with self._turn, with_progress(self._progress):
             asked = self.state.asked
             if asked is not None and start is None and goal is None and robots is None:
                 course = Course.of(asked)._replace(closed=self._closed)
@@ -280,7 +280,7 @@ class Campaign(Recorder):
             TrustboError: The path is invalid, a robot is unknown, or the plan cannot be recorded.
                 `ask` then returns the same plan as before.
         """
-        with self._turn:
+        with self._turn, with_progress(self._progress):
             self.storage.require_open()
             cells = require_path("path", path)
             if len(cells) < 2:
@@ -330,7 +330,7 @@ class Campaign(Recorder):
         Example:
             >>> campaign.replan((2, 1), so_far)  # the team is stuck on its way to (1, 2)
         """
-        with self._turn:
+        with self._turn, with_progress(self._progress):
             asked = self.state.asked
             plan = self.ask() if asked is None else asked
             self._learn()
@@ -382,7 +382,7 @@ class Campaign(Recorder):
         """
         require_switch("again", again)
         require_kind("mission", mission, Mission, "give one trustbo.Mission at a time")
-        with self._turn:
+        with self._turn, with_progress(self._progress):
             self.storage.require_open()
             asked = self.state.asked
             mission = self._in_order(mission, None if asked is None else asked.robots)
@@ -417,7 +417,7 @@ class Campaign(Recorder):
             >>> campaign.correct(1, drive(path), "log of another detector")
         """
         require_kind("mission", mission, Mission, "give one trustbo.Mission at a time")
-        with self._turn:
+        with self._turn, with_progress(self._progress):
             self._require_mission(n, reason)
             entries = self.state.entries
             plan = entries[n - 1].plan
