@@ -92,11 +92,17 @@ def figures() -> Iterator[Figure]:
     yield Figure(
         "trustbo.Result.plot_history", lambda: result.plot_history(),
         "Contact lost in each mission, measured and predicted by the plan. The first plan does "
-        "not know of the scrub and of the damage; from mission 3, predictions agree.",
+        "not know of the scrub and of the damage; later predictions agree, but in mission 5, "
+        "which tries new bounds.",
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.plan_map", lambda: plots.plan_map(result.plan(), bounds=[1, 2]),
         "The path with its overwatch points, and routes and sight lines of two bounds.", wide=True,
+    )  # fmt: skip
+    yield Figure(
+        "trustbo.plots.ways_map", lambda: plots.ways_map(result.ways()),
+        "Ways from start to goal: contact lost, probability of arrival and length. No other path "
+        "is better in all three.",
     )  # fmt: skip
     yield Figure(
         "trustbo.plots.robot_effects", lambda: plots.robot_effects(robots),
