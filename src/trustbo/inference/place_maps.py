@@ -29,7 +29,7 @@ from trustbo.models.robots_in_bounds import RobotsInBounds
 from trustbo.models.sight_scale import scale_at, variation
 from trustbo.models.visited import Visited
 from trustbo.workspace import Workspace
-from trustbo.workspace.moves import MOVE_NAMES
+from trustbo.workspace.moves import MOVE_NAMES, for_sets
 
 _STEP = 0.1
 """Step of log length scales."""
@@ -204,7 +204,7 @@ def _of_bounds(
     if n_posts > 1:
         of_all = rng.standard_normal((len(tau_e), len(MOVE_NAMES), *sight.shape[1:]))
         e *= np.sqrt(1.0 - BETWEEN_POSTS)
-        e += np.sqrt(BETWEEN_POSTS) * np.tile(of_all, (1, n_posts, 1, 1))
+        e += np.sqrt(BETWEEN_POSTS) * for_sets(of_all, n_posts)
     scale = scale_at(variation(sight), f_e)
 
     if f_e < 1.0:
@@ -213,7 +213,7 @@ def _of_bounds(
         is_known = np.zeros((len(MOVE_NAMES), *sight.shape[1:]), bool)
         is_known[ways % len(MOVE_NAMES), rows, cols] = True
         share = np.where(to_middle == 0.0, 0.0, _SHARE_WRONG)
-        share[np.tile(is_known, (n_posts, 1, 1))] = 0.0
+        share[for_sets(is_known, n_posts)] = 0.0
         is_wrong = rng.random(e.shape, dtype=np.float32) < share
         scale = np.where(is_wrong, _SD_WRONG, scale)
         np.copysign(e, to_middle, out=e, where=is_wrong)
@@ -244,7 +244,7 @@ def _learn_from_other_posts(
         n_visited[bound] += 1.0
 
     more *= BETWEEN_POSTS / (1.0 + (n_visited - 1.0) * BETWEEN_POSTS)
-    free += sd * np.tile(more, (1, n_ways // len(MOVE_NAMES), 1, 1))
+    free += sd * for_sets(more, n_ways // len(MOVE_NAMES))
 
 
 def in_order_of_places(group: xr.Dataset) -> xr.Dataset:

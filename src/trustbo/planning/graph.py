@@ -9,6 +9,7 @@ from trustbo.models.draws import Draws
 from trustbo.planning.objectives import LOST_CONTACT, capped
 from trustbo.planning.paths import STEPS
 from trustbo.planning.problem import Problem, risk_of
+from trustbo.workspace.moves import for_sets
 
 
 def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph | nx.MultiDiGraph:
@@ -25,8 +26,8 @@ def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph | nx.MultiDiGraph:
     workspace = problem.paths.workspace
     grid = workspace.grid
     n_posts = workspace.n_posts
-    bounds = np.tile(problem.paths.bounds, (n_posts, 1, 1))
-    steps = np.tile(STEPS, (n_posts, 1))
+    bounds = for_sets(problem.paths.bounds, n_posts)
+    steps = for_sets(STEPS, n_posts, axis=0)
     length = np.hypot(*(steps * (grid.cell_height, grid.cell_width)).T)  # (way,)
 
     def of_bounds(values: np.ndarray) -> np.ndarray:
@@ -35,7 +36,7 @@ def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph | nx.MultiDiGraph:
     trust = of_bounds(recursion.steady_state()[0])
     of_contact = of_bounds(contact.steady_state()[0])
     rate = problem.likelihood.mean_rate(of_contact, recursion.noise_sd)
-    bound_cost = np.tile(problem.bound_cost, (n_posts, 1, 1))
+    bound_cost = for_sets(problem.bound_cost, n_posts)
     lost = of_bounds(bound_cost) + np.maximum(1.0 - rate, 0.0)  # without rounding
     cost, constant = problem.costs_of_bounds(trust, lost)
     values = {

@@ -27,6 +27,7 @@ from trustbo.workspace import Workspace
 from trustbo.workspace.moves import (
     END,
     cells_along,
+    for_sets,
     moves_along,
     next_names,
     pairs_along,
@@ -199,14 +200,14 @@ class Problem(Uncached):
             over n bounds.
         """
         n_posts = self.paths.workspace.n_posts
-        bounds = np.tile(self.paths.bounds, (n_posts, 1, 1))
+        bounds = for_sets(self.paths.bounds, n_posts)
         if self.objective.of_contact:
             if self.risk is None:
                 return lost, 0.0
             p_fail = np.nan_to_num(self.risk.of_bounds)
             return lost + self.cost_of_failure * p_fail[bounds], 0.0
 
-        bound_cost = np.tile(self.bound_cost, (n_posts, 1, 1))[bounds]
+        bound_cost = for_sets(self.bound_cost, n_posts)[bounds]
         credit = self.objective.credit(np.arange(self.paths.longest + 1))
         if credit[1:].any():
             cost = bound_cost - trust

@@ -19,7 +19,7 @@ from trustbo.terrain import FEATURES, CompositeIndex
 from trustbo.terrain.features import pixel_feature
 from trustbo.workspace.grid import MAX_MISSING, Grid
 from trustbo.workspace.line_of_sight import bound_maps
-from trustbo.workspace.moves import MOVES, existing_bounds, way_names
+from trustbo.workspace.moves import MOVES, existing_bounds, for_sets, way_names
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface
@@ -165,7 +165,7 @@ def with_line_of_sight(
     is_known = TRAVERSABLE in pixels
     of_pixels = pixels[TRAVERSABLE].values if is_known else posts.surface.passable
     seen, traversability = bound_maps(posts, passable, of_pixels, n_posts)
-    z = np.tile(z, (1, n_posts, 1, 1, 1))
+    z = for_sets(z, n_posts, axis=1)
     if is_known:
         of_cells = z[..., list(pixels).index(TRAVERSABLE)]
         of_cells[...] = np.where(np.isfinite(traversability), traversability, of_cells)
@@ -274,7 +274,7 @@ def of_arrays(z: np.ndarray, passable: ArrayLike | None) -> tuple[np.ndarray, np
     if z.ndim == 4:
         return of_moves(z, free), free
 
-    exists = np.tile(existing_bounds(free), (z.shape[1] // len(MOVES), 1, 1))
+    exists = for_sets(existing_bounds(free), z.shape[1] // len(MOVES))
     if (missing := exists & ~finite).any():
         m, row, col = (int(i) for i in np.argwhere(missing)[0])
         down, right = MOVES[m % len(MOVES)]

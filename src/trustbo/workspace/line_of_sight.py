@@ -30,7 +30,7 @@ import numpy as np
 from trustbo.data import POST_SETS, Cell, Station
 from trustbo.parallel import in_order
 from trustbo.team import Robot, Team
-from trustbo.workspace.moves import MOVES, existing_bounds, possible_next
+from trustbo.workspace.moves import MOVES, existing_bounds, for_sets, possible_next
 from trustbo.workspace.posts import Posts
 from trustbo.workspace.routes import at_times
 from trustbo.workspace.sight import Sight, detection_between, jittered, optics
@@ -64,7 +64,7 @@ def bound_maps(
         Two arrays of shape (robot, way, row, col), in [0, 1], for the first `n_posts` sets of
         posts; NaN where there is no bound or no data along the tracks.
     """
-    exists = np.tile(existing_bounds(passable), (n_posts, 1, 1))
+    exists = for_sets(existing_bounds(passable), n_posts)
     maps = np.full((2, len(posts.team.robots), *exists.shape), np.nan)
 
     def of_block(block: Sequence[np.ndarray]) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:

@@ -49,6 +49,11 @@ def way_names(n_posts: int) -> list[str]:
     return [*MOVE_NAMES, *others]
 
 
+def for_sets(of_moves: np.ndarray, n_posts: int, *, axis: int = -3) -> np.ndarray:
+    """Repeat values by move for each set of posts, so that `axis` becomes that of the ways."""
+    return np.concatenate([of_moves] * n_posts, axis=axis)
+
+
 def next_names(n_posts: int) -> list[str]:
     """Return the names of the ways that can follow a bound, and `"end"`."""
     return [*way_names(n_posts), "end"]
@@ -105,10 +110,10 @@ def possible_next(bounds: np.ndarray, n_posts: int = 1) -> np.ndarray:
         bounds: Whether each bound exists, shape (move, row, col).
         n_posts: Number of sets of posts, from each of which each bound can be watched.
     """
-    onward = np.tile(by_cell_left(bounds, False), (n_posts, 1, 1))
+    onward = for_sets(by_cell_left(bounds, False), n_posts)
     anything = np.ones(bounds.shape[1:], bool)  # a path can end in any cell
     follows = bounds[..., None] & np.stack([*onward, anything], axis=-1)
-    return np.tile(follows, (n_posts, 1, 1, 1))
+    return for_sets(follows, n_posts, axis=0)
 
 
 def by_option(maps: np.ndarray) -> np.ndarray:

@@ -56,7 +56,7 @@ from trustbo.workspace.closed import closed_mask, closed_text, require_closed
 from trustbo.workspace.difficulty import Difficulty
 from trustbo.workspace.grid import MAX_MISSING, Grid, Location
 from trustbo.workspace.line_of_sight import onward_maps
-from trustbo.workspace.moves import MOVE_NAMES, MOVES, existing_bounds, pairs_along
+from trustbo.workspace.moves import MOVE_NAMES, MOVES, existing_bounds, for_sets, pairs_along
 from trustbo.workspace.posts import TRAVERSABLE, Posts
 from trustbo.workspace.sight import Sight
 from trustbo.workspace.surface import Surface, surface_of
@@ -577,7 +577,7 @@ class Workspace(Fixed, Summary):
         exposure = np.zeros(self.passable_bounds.shape)
         if threat is not None:
             exposure = exposure_of(self.grid, threat)
-        of_ways = np.tile(exposure, (self.n_posts, 1, 1))
+        of_ways = for_sets(exposure, self.n_posts)
 
         names = [name for name in self.features if name != THREAT]
         known = self.awareness.sel(feature=names)
