@@ -249,14 +249,15 @@ def warn_of_times(tracks: pd.DataFrame, looks: pd.DataFrame, tick: float) -> Non
 def warn_of_silence(tracks: pd.DataFrame, looks: pd.DataFrame, leads: Sequence[str]) -> None:
     """Warn of robots whose detections of the leads end long before their poses do."""
     of_lead = looks.loc[looks["lead"].isin(leads)].sort_values("t")
-    ends = tracks.groupby("robot")["t"].max()
-    lead_ends = ends[[name for name in leads if name in ends.index]].max()
+    ends = {str(name): np.max(t.to_numpy(float)) for name, t in tracks.groupby("robot")["t"]}
+    lead_ends = max(ends[name] for name in leads)
     silent = {}
-    for name, t in of_lead.groupby("robot")["t"]:
-        silence = min(ends[name], lead_ends) - t.iloc[-1]
-        longest = t.diff().max()
+    for watcher, times in of_lead.groupby("robot")["t"]:
+        name, t = str(watcher), times.to_numpy(float)
+        silence = min(ends[name], lead_ends) - t[-1]
+        longest = float(np.diff(t).max(initial=0.0))
         if len(t) >= _OFTEN_SEEN and silence > max(_SILENCE, _UNUSUAL * longest):
-            silent[str(name)] = silence
+            silent[name] = silence
 
     if silent:
         warn(
