@@ -271,8 +271,8 @@ def _tables(result: Result, path_table: pd.DataFrame) -> dict[str, str]:
         empty.append("lost_share")
     if not (missions["n_unmeasured"] > 0).any():
         empty.append("n_unmeasured")
-    empty += [name for name in ("began",) if name not in missions]
-    missions = missions[[name for name in _OF_MISSIONS if name not in empty]]
+    shown = [name for name in _OF_MISSIONS if name in missions and name not in empty]
+    missions = missions[shown]
     if result.settings["objective"] == "lost_contact":
         missions = missions.assign(objective=-missions["objective"])
         missions = missions.rename(columns={"objective": "predicted_lost"})

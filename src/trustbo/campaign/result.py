@@ -575,14 +575,14 @@ class Result(Summary):
         if self.workspace.terrain is None:
             raise TrustboError("limits needs a workspace made with Workspace.from_terrain.")
 
+        def changed(degrees: float) -> Plan:
+            margin = self.hazard["margin"] - degrees
+            risk = BoundRisk(self.hazard.assign(margin=margin), self.workspace)
+            return self._best(informed_planner(self._base_of(course), risk), course)
+
         def rows() -> pd.DataFrame:
-            plans = {}
-            for change in (-degrees, 0.0, degrees):
-                margin = self.hazard["margin"] - change
-                risk = BoundRisk(self.hazard.assign(margin=margin), self.workspace)
-                planner = informed_planner(self._base_of(course), risk)
-                plans[change] = self._best(planner, course)
-            return limits_table(plans)
+            plans = {-degrees: changed(-degrees), 0.0: self.plan(start, goal, robots=robots)}
+            return limits_table(plans | {degrees: changed(degrees)})
 
         return self._of_course(f"limits {degrees}", course, rows).copy()
 

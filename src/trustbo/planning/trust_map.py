@@ -7,7 +7,7 @@ from scipy.special import expit
 
 from trustbo.data import path_text
 from trustbo.models.draws import Draws
-from trustbo.planning.objectives import TERMINAL, weights_of
+from trustbo.planning.objectives import TERMINAL, Weights, weights_of
 from trustbo.planning.paths import SIMPLE_EXTRA, STEPS, AdmissiblePaths
 from trustbo.planning.problem import Problem
 from trustbo.planning.recursion import Recursion, states_along
@@ -80,11 +80,13 @@ def _largest(
     drift = recursion.drift.reshape(*recursion.start.shape, -1)
     values = np.full((len(drift), *paths.bounds.shape[1:]), np.nan)
     no_cost = np.zeros(drift.shape[-1])
+    some = slice(1 if led else None)  # draws that choose their paths
     for row, col in np.argwhere(paths.bounds_from_start > 0).tolist():
         graph_paths = paths.to((row, col), extra)
         graph = graph_paths.graph
         weights = weights_of(TERMINAL, recursion, state_weights, graph.longest)
-        scores, found = best_sums(graph, drift, weights, no_cost)
+        searched = Weights(weights.per_bound[some], weights.constant[some], weights.scale)
+        scores, found = best_sums(graph, drift[some], searched, no_cost)
         if led:
             path = graph_paths.cells(found[0])
             ways = pairs_along(path, paths.workspace.n_posts)[:, :3].T
