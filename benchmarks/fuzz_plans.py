@@ -171,6 +171,7 @@ def draw_problem(rng):
     params, u, B0, x0, sd, of_sight = draw_model(
         rng, by_bound, pick(rng, "usual", "usual", "large", "tied", "zeros")
     )
+    params = params.replace(family=family)
     u = np.repeat(u[..., None], 8 * n_posts + 1, axis=-1)
     workspace = Workspace.from_awareness(z, passable)
     if n_posts > 1:  # line of sight, the second feature, depends on the next way
@@ -194,7 +195,7 @@ def draw_problem(rng):
         else draw_risk(rng, of_posts, (8, *shape), n_posts, objective == "lost_contact")
     )
     planner = Planner(
-        workspace, start, goal, objective, family=family,
+        workspace, start, goal, objective,
         bound_cost=bound_cost,
         max_bounds=shortest + extra if turns else f"shortest+{extra}", **options,
     )  # fmt: skip

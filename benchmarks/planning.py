@@ -77,16 +77,17 @@ def one_plan(table, n):
     workspace, components = workspace_of(n), components_of(n)
     mean = np.tensordot(components.weights, components.p_fail, 1)
     for family in ("gaussian", "censored"):
+        params = PARAMS.replace(family=family)
         for label, options, risk in (
             ("", {}, None),
             (", failure cost of one component", {}, (mean,)),
             (", failure cost of five components", {}, (mean, None, components)),
             (", max_failure", {"max_failure": 0.2, "failure_cost": 0.0}, (mean,)),
         ):
-            planner = Planner(workspace, (n - 1, 0), (0, n - 1), family=family, **options)
+            planner = Planner(workspace, (n - 1, 0), (0, n - 1), **options)
             planner = planner if risk is None else planner.with_risk(*risk)
-            exact = "" if planner.plan(PARAMS).exact else "not exact"
-            took = milliseconds(lambda p=planner: p.plan(PARAMS), 21 if n < 20 else 5)
+            exact = "" if planner.plan(params).exact else "not exact"
+            took = milliseconds(lambda p=planner, q=params: p.plan(q), 21 if n < 20 else 5)
             table.row(f"plan, {n} x {n}, {family}{label}", f"{took:.2f}", exact)
 
 

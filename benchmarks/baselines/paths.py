@@ -6,7 +6,6 @@ if there is no such bound.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -97,8 +96,9 @@ def _best_with_failures(problem: Problem, rates: np.ndarray) -> list[Path]:
         drift=drift,
         start=np.zeros((n_draws, 1)),
         noise_sd=np.ones(n_draws),  # matters only for censored rates
+        likelihood=FAMILIES["gaussian"],
     )
-    _, _, found = replace(problem, likelihood=FAMILIES["gaussian"]).best(recursion)
+    _, _, found = problem.best(recursion)
     return [paths.cells(flat) for flat in found]
 
 

@@ -47,11 +47,10 @@ def plan(planner: Planner, params: Draws | xr.DataTree, *, x0: ArrayLike | None 
     """
     started = time.perf_counter()
     problem = planner.problem
-    problem.require_family(params)
     mean, draws = mean_and_draws_of(params, planner.workspace)
-    recursion = capped(problem.objective, problem.likelihood, problem.recursion(mean, x0))
+    recursion = capped(problem.objective, problem.recursion(mean, x0))
 
-    if problem.edge_risks is not None or has_history(problem.objective, problem.likelihood):
+    if problem.edge_risks is not None or has_history(problem.objective, mean.likelihood):
         paths = every_path(problem.paths)
     else:
         paths = shortest_paths(planner, recursion)
@@ -171,9 +170,9 @@ def _value_of(
     """Compute the value of a path, with the expected cost of failure."""
     z, bounds = problem.along(path)
     recursion = trust_recursion(mean, z, problem.initial_trust(x0), bounds=bounds)
-    along = capped(problem.objective, problem.likelihood, recursion)
+    along = capped(problem.objective, recursion)
     trust = states_along(along).mean(-1)
-    value = problem.value_along(problem.bound_cost_along(path), trust, along.noise_sd)
+    value = problem.value_along(problem.bound_cost_along(path), trust, along)
     return value.item() - problem.failure_along(path)
 
 

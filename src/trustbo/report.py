@@ -150,8 +150,8 @@ def bounds_of(result: Result) -> pd.DataFrame:
     """
     plan = result.plan()
     problem = result.planner.problem
-    noise_sd = problem.recursion(result.belief.mean()).noise_sd
-    contact = np.minimum(problem.likelihood.mean_rate(plan.trust, noise_sd), 1.0)
+    mean = problem.recursion(result.belief.mean())
+    contact = np.minimum(mean.likelihood.mean_rate(plan.trust, mean.noise_sd), 1.0)
 
     state = result.state
     earlier = [mission for mission in state.earlier.missions if not mission.map]

@@ -67,13 +67,11 @@ def test_plans_of_every_model_are_the_best_of_all_paths(kind, family):
     """Trust is that of the dense reference, and values are by their definition."""
     z = np.random.default_rng(2).uniform(size=(3, 8, 3, 3, 2))
     workspace = Workspace.from_awareness(z)
-    params = draws_of(kind, shape=(3, 3)).draw(0)
+    params = draws_of(kind, shape=(3, 3)).draw(0).replace(family=family)
     one = mission_of_params(params, np.zeros((1, 3, 2)), [(0, 0), (0, 1)])
     noise_sd = np.sqrt(np.diag(one.rate_cov - one.trust_cov)).mean()
     for objective in OBJECTIVES:
-        planner = Planner(
-            workspace, (2, 0), (0, 2), objective, family=family, max_bounds="shortest+2"
-        )
+        planner = Planner(workspace, (2, 0), (0, 2), objective, max_bounds="shortest+2")
         plan = planner.plan(params)
         values = {
             path: value_of(params, workspace, path, objective, family, noise_sd)
@@ -190,7 +188,8 @@ def problem_without_memory(rng, objective, **options):
 def test_without_memory_the_shortest_path_of_networkx_is_the_plan(objective, family):
     for seed in range(25):
         rng = np.random.default_rng(seed)
-        planner, params = problem_without_memory(rng, objective, family=family)
+        planner, params = problem_without_memory(rng, objective)
+        params = params.replace(family=family)
         graph, plan = planner.graph(params), planner.plan(params)
         assert min(cost for _, _, cost in graph.edges(data="cost")) >= 0.0
 
@@ -297,8 +296,8 @@ def test_what_cannot_be_planned_is_refused(workspace):
         with pytest.raises(TrustboError, match=r"start|goal"):
             Planner(workspace, *ends)
     for name, value in (
-        ("objective", "best"), ("family", "normal"), ("max_bounds", 3), ("max_bounds", 0),
-        ("max_bounds", "long"), ("max_failure", 1.0), ("max_failure", True), ("failure_cost", -1.0),
+        ("objective", "best"), ("max_bounds", 3), ("max_bounds", 0), ("max_bounds", "long"),
+        ("max_failure", 1.0), ("max_failure", True), ("failure_cost", -1.0),
     ):  # fmt: skip
         with pytest.raises(TrustboError, match=name):
             Planner(workspace, *ENDS, **{name: value})
@@ -340,29 +339,31 @@ def test_with_a_risk_the_limit_is_on_the_states_that_know_the_bound_before(works
         planner.with_risk(np.full((8, 5, 6), 0.01)).plan(PARAMS)
 
 
-def test_logits_of_a_posterior_are_not_read_as_contact_rates():
+def test_plans_have_the_family_of_the_posterior():
+    """Trust is a logit here, which must not be read as a contact rate."""
     workspace = Workspace.from_awareness(np.random.default_rng(0).uniform(size=(1, 1, 6, 2)))
     missions = counted_missions("beta_binomial", n=3)[2]
     posterior = fit(missions, PooledTrust(family="beta_binomial"), draws=100, progress=False)
     planner = Planner(workspace, (0, 0), (0, 5))
     path = tuple((0, k) for k in range(6))
-    for use in (
-        planner.plan,
-        planner.plan_draws,
-        planner.graph,
-        planner.robot_maps,
-        lambda given: planner.evaluate(path, given),
-        lambda given: planner.trust(given, as_rate=True),
-    ):
-        with pytest.raises(TrustboError, match="family='beta_binomial'"):
-            use(posterior)
-
-    right = Planner(workspace, (0, 0), (0, 5), family="beta_binomial").plan(posterior)
-    lost = 1.0 - expit(right.trust.mean(1))
-    assert right.value == pytest.approx(-lost.sum(), rel=1e-9)
+    plan = planner.plan(posterior)
+    lost = 1.0 - expit(plan.trust.mean(1))
+    assert plan.value == pytest.approx(-lost.sum(), rel=1e-9)
     of_trust = Planner(workspace, (0, 0), (0, 5), "mean").plan(posterior)  # no rates
-    assert of_trust.value == pytest.approx(right.trust.mean(), rel=1e-9)
-    assert planner.trust(posterior, cell=(0, 3)).notnull().all()
+    assert of_trust.value == pytest.approx(plan.trust.mean(), rel=1e-9)
+
+    draws = params_of(posterior, workspace)
+    trust = planner.trust(draws, cell=(0, 3), move="e")
+    rate = planner.trust(draws, cell=(0, 3), move="e", as_rate=True)
+    np.testing.assert_allclose(rate, expit(trust), rtol=1e-12)
+    maps = planner.robot_maps(draws).isel(y=0, x=3)
+    np.testing.assert_allclose(maps["contact_rate"], rate.mean("draw"), rtol=1e-9)
+
+    drawn = planner.plan_draws(draws)
+    values = [planner.evaluate(path, draws.draw(d)).value for d in range(draws.n_draws)]
+    np.testing.assert_allclose(drawn.values, values, rtol=1e-9)
+    edge = planner.graph(draws).edges[(0, 2), (0, 3)]
+    assert edge["lost"] == pytest.approx(1.0 - expit(edge["trust"]), rel=1e-9)
 
 
 @pytest.mark.parametrize("weights", [[0.5], [1.0, 1.0], [np.nan, 1.0], [2.0, -1.0]])

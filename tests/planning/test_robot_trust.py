@@ -248,8 +248,8 @@ def test_maps_of_the_next_mission_are_those_of_drawn_effects(with_robot_effects)
 
 @pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
 def test_rates_are_the_mean_of_the_family_at_the_trust_of_each_bound(workspace, family):
-    draws = sample_prior(HierarchicalTrust(), 2, 20, 4, n_robots=3)
-    planner = Planner(workspace, *ENDS, family=family)
+    draws = sample_prior(HierarchicalTrust(), 2, 20, 4, n_robots=3).replace(family=family)
+    planner = Planner(workspace, *ENDS)
     trust = planner.trust(draws, "ant", (2, 2), move="s").values
     sd = draws.delta_v[:, 0]
     rate = {

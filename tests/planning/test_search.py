@@ -2,6 +2,7 @@
 
 import functools
 import pickle
+from dataclasses import replace
 
 import jax.numpy as jnp
 import networkx as nx
@@ -113,7 +114,9 @@ def draws_of_function(workspace, by_robot):
 @pytest.mark.parametrize("by_robot", [False, True])
 def test_networkx_finds_plans_of_functions(workspace, options, by_robot):
     """With and without weights of each robot."""
-    draws = draws_of_function(workspace, by_robot)
+    options = dict(options)
+    family = options.pop("family", "gaussian")
+    draws = replace(draws_of_function(workspace, by_robot), family=family)
     planner = Planner(workspace, *ENDS, **options)
     if "max_failure" in options:
         planner = planner.with_risk(np.random.default_rng(0).uniform(0.0, 0.1, (8, 4, 4)))
@@ -252,17 +255,20 @@ def test_draws_are_planned_as_one_by_one(workspace):
         np.full(70, 0.1),
     )  # fmt: skip
     p = rng.uniform(0.0, 0.1, (8, 4, 4))
-    for options in ({}, {"family": "censored"}, {"objective": "mean", "max_failure": 0.5}):
+    for family, options in (
+        ("gaussian", {}), ("censored", {}), ("gaussian", {"objective": "mean", "max_failure": 0.5})
+    ):  # fmt: skip
+        draws = draws.replace(family=family)
         planner = Planner(workspace, *ENDS, **options).with_risk(p)
         alone = [planner.plan(draws.draw(d)).value for d in range(70)]
         np.testing.assert_allclose(planner.plan_draws(draws).values, alone, rtol=1e-9)
 
 
 def test_objectives_of_contact_need_memory_that_is_not_negative(workspace):
-    forgetful = PARAMS.replace(beta0=-0.2)
     for family in ("gaussian", "censored"):
+        forgetful = PARAMS.replace(beta0=-0.2, family=family)
         with pytest.raises(TrustboError, match="beta0"):
-            Planner(workspace, *ENDS, family=family).plan(forgetful)
+            Planner(workspace, *ENDS).plan(forgetful)
     assert Planner(workspace, *ENDS, "mean").plan(forgetful).exact
 
 
@@ -279,9 +285,9 @@ def test_contact_that_is_lost_depends_on_all_noise_of_a_rate():
     workspace = Workspace.from_awareness(
         rng.uniform(size=(2, 3, 3, 1)), features=("line_of_sight",)
     )
-    planner = Planner(workspace, (0, 0), (2, 2), objective="lost_contact", family="censored")
-    shared = TrustParams(0.5, np.array([0.4]), 0.3, 0.05, 0.1, delta_s=0.3)
-    own = TrustParams(0.5, np.array([0.4]), 0.3, 0.05, np.hypot(0.1, 0.3))
+    planner = Planner(workspace, (0, 0), (2, 2), objective="lost_contact")
+    shared = TrustParams(0.5, np.array([0.4]), 0.3, 0.05, 0.1, delta_s=0.3, family="censored")
+    own = TrustParams(0.5, np.array([0.4]), 0.3, 0.05, np.hypot(0.1, 0.3), family="censored")
 
     path = [(0, 0), (1, 1), (2, 2)]
     values = [planner.evaluate(path, params).value for params in (shared, own)]

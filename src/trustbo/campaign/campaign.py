@@ -169,7 +169,7 @@ class Campaign(Recorder):
             missing = "goal" if has_course else "start"
             raise TrustboError(f"{missing} is missing; give both start and goal, or neither.")
         ends: tuple[Any, Any] = (start, goal) if has_course else _any_ends(workspace)
-        base = Planner(workspace, *ends, objective, family=learner.family, **options)
+        base = Planner(workspace, *ends, objective, **options)
         settings = to_settings(
             base,
             learner,

@@ -206,7 +206,7 @@ def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:
 
     lost = 0.0
     if problem.objective.of_contact and n_driven:
-        lost = _contact_lost(problem, driven) + problem.bound_cost_along(driven.path)
+        lost = _contact_lost(driven) + problem.bound_cost_along(driven.path)
     band = rest.value_band
     if band is not None:
         band = band[0] - lost, band[1] - lost
@@ -226,9 +226,9 @@ def whole_plan(problem: Problem, driven: Driven, rest: Plan) -> Plan:
     )
 
 
-def _contact_lost(problem: Problem, driven: Driven) -> float:
+def _contact_lost(driven: Driven) -> float:
     """Compute the contact lost so far, in bounds; expected contact is used where none is known."""
     noise_sd = driven.filter.space.rate_sd.mean()
-    expected = problem.likelihood.mean_rate(driven.trust, noise_sd)
+    expected = driven.filter.likelihood.mean_rate(driven.trust, noise_sd)
     rates = np.where(np.isnan(driven.contact_rate), expected, driven.contact_rate)
     return float((1.0 - rates).mean(1).sum())

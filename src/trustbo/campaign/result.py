@@ -34,7 +34,6 @@ from trustbo.inference.learner import Learner
 from trustbo.inference.score import Posteriors
 from trustbo.models.backend import VERSIONS
 from trustbo.models.draws import Draws, NextMission
-from trustbo.models.families import FAMILIES, Family
 from trustbo.parallel import computing
 from trustbo.planning import InfeasibleError, Plan, Planner
 from trustbo.planning.maps import maps_of
@@ -488,12 +487,7 @@ class Result(Summary):
         require_switch("expected", expected)
         draws = self._ahead.of_robots(expected=expected)
         about = {"move": move, "posts": posts, "as_rate": as_rate}
-        return robot_trust(self.workspace, self._rates, draws, robot, cell, **about)
-
-    @property
-    def _rates(self) -> Family:
-        """Observation family of the contact rates."""
-        return FAMILIES[self.state.settings["family"]]
+        return robot_trust(self.workspace, draws, robot, cell, **about)
 
     def compare_posts(self) -> pd.DataFrame:
         """Compare the sets of posts in each bound of the recommended path.
@@ -630,7 +624,7 @@ class Result(Summary):
             `trust_sd` of trust, and the mean `contact_rate`; see `planning.Planner.robot_maps`.
         """
         require_switch("expected", expected)
-        return robot_maps(self.workspace, self._rates, self._ahead.of_robots(expected=expected))
+        return robot_maps(self.workspace, self._ahead.of_robots(expected=expected))
 
     @property
     def trust_map(self) -> xr.DataArray:

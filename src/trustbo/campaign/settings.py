@@ -20,8 +20,6 @@ _UNCHANGED = ("objective", "sampler", "seed", "initial", "awareness", "planner",
 """Arguments of `Campaign` that are stored unchanged."""
 _OF_PLANNER = ("workspace", "start", "goal", "objective")
 """Arguments of `Planner` that are also arguments of `Campaign`."""
-_SET_IN_PLANNER = ("family",)
-"""Arguments of `Planner` that a campaign sets itself."""
 _OF_FIT = ("model", "earlier", "sampler", "workspace", "seed", "progress")
 """Arguments of `fit` that are also arguments of `Campaign`."""
 _SET_IN_FIT = ("missions", "latent", "start")
@@ -35,9 +33,9 @@ def require_options_of_planner(options: Any) -> dict[str, Any]:
     `Planner` checks the other names and the values.
 
     Raises:
-        TrustboError: The options are not a dict, or one of them is given to or set by the campaign.
+        TrustboError: The options are not a dict, or one of them is an argument of the campaign.
     """
-    return _require_options("planner", options, _OF_PLANNER, _SET_IN_PLANNER)
+    return _require_options("planner", options, _OF_PLANNER)
 
 
 def require_options_of_fit(options: Any) -> dict[str, Any]:
@@ -59,7 +57,7 @@ def require_options_of_fit(options: Any) -> dict[str, Any]:
 
 
 def _require_options(
-    what: str, options: Any, own: Sequence[str], set_itself: Sequence[str]
+    what: str, options: Any, own: Sequence[str], set_itself: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Return options as a new dict; raises TrustboError for names in `own` and `set_itself`."""
     if options is None:
@@ -110,7 +108,6 @@ def to_settings(
         "policy": _text_of(policy),
         **options,
         "hazard": asdict(hazard),
-        "family": learner.family,
         "model": learner.in_short(),
         "model_record": learner.record(),
     }
@@ -147,14 +144,7 @@ def to_planner(
     settings: Mapping[str, Any], workspace: Workspace, start: Location, goal: Location
 ) -> Planner:
     """Make the planner of a course before any learning, for the robots of the workspace."""
-    return Planner(
-        workspace,
-        start,
-        goal,
-        settings["objective"],
-        family=settings["family"],
-        **settings["planner"],
-    )
+    return Planner(workspace, start, goal, settings["objective"], **settings["planner"])
 
 
 def name_of(function: object) -> str:

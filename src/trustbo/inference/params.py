@@ -170,6 +170,7 @@ def read_params(
 
     others = {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")}
     others["memory"] = posterior.attrs.get("memory", "level")
+    others["family"] = posterior.attrs["family"]
     theta = model.derived(parameters)
     return [
         assemble_params(values, **others, **places).in_order(*names)
@@ -573,7 +574,7 @@ def sample_prior(
     prior = _prior(model, n_features, n_robots)
     rng = np.random.default_rng(seed)
     parameters = prior_parameters(prior, n_draws, rng)
-    return assemble_params(parameters, **model.x0, memory=model.memory)
+    return assemble_params(parameters, **_settings_of(model))
 
 
 def sample_prior_ahead(
@@ -599,7 +600,7 @@ def sample_prior_ahead(
     theta = model.derived(parameters)
     names = workspace.team.names, workspace.features
     expected, drawn = (
-        assemble_params(values, **model.x0, memory=model.memory, **places).in_order(*names)
+        assemble_params(values, **_settings_of(model), **places).in_order(*names)
         for values, places in with_prior_effects_ahead(
             workspace, model.effects, theta, parameters, seed
         )
@@ -650,7 +651,12 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
     rng = np.random.default_rng(0)
     parameters = prior_parameters(prior, _N_MEAN, rng, even=True)
     parameters = {name: values.mean(0, keepdims=True) for name, values in parameters.items()}
-    return assemble_params(parameters, **model.x0, memory=model.memory)
+    return assemble_params(parameters, **_settings_of(model))
+
+
+def _settings_of(model: TrustModel) -> dict[str, Any]:
+    """Return the arguments of `Params` that are settings of a model."""
+    return {**model.x0, "memory": model.memory, "family": model.family}
 
 
 def _prior(model: TrustModel, n_features: int, n_robots: int) -> Density:

@@ -11,6 +11,7 @@ from trustbo.arrays import Names
 from trustbo.data import sight_columns
 from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError, require_switch
+from trustbo.models.families import FAMILIES, Family
 from trustbo.models.robots_in_bounds import RobotsInBounds
 from trustbo.models.sight_scale import scale_at, variation
 from trustbo.statespace import Inputs, StateSpace
@@ -100,6 +101,7 @@ class Draws(Summary):
         robots: Names of the robots, in the order of the arrays; None if they are not known.
         features: Names of the features, in the order of the arrays; None if they are not known.
         memory: Quantity carried over between bounds, `"level"` or `"deviation"`; see `PooledTrust`.
+        family: Name of the observation family of the contact rates; see `PooledTrust`.
     """
 
     arrays: Mapping[str, np.ndarray]
@@ -108,6 +110,7 @@ class Draws(Summary):
     robots: Names | None = None
     features: Names | None = None
     memory: str = "level"
+    family: str = "gaussian"
 
     def __getattr__(self, name: str) -> np.ndarray:
         # Copies and unpickled objects are asked for special names before they have any field.
@@ -124,6 +127,11 @@ class Draws(Summary):
     def values(self) -> Mapping[str, np.ndarray]:
         """Parameters (draw, ...) by name; those of a function are its variables."""
         return self.arrays if self.own is None else self.own.values
+
+    @property
+    def likelihood(self) -> Family:
+        """Observation family of the contact rates."""
+        return FAMILIES[self.family]
 
     @property
     def n_draws(self) -> int:

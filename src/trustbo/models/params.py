@@ -8,8 +8,9 @@ import numpy as np
 import xarray as xr
 
 from trustbo.arrays import Names, as_names, read_labelled, require_numbers
-from trustbo.errors import TrustboError
+from trustbo.errors import TrustboError, require_choice
 from trustbo.models.draws import PLACES, Draws
+from trustbo.models.families import FAMILIES
 from trustbo.models.robots_in_bounds import RobotsInBounds
 
 Numbers = Any
@@ -37,25 +38,28 @@ class LinearParams(Draws):
         place_robot: RobotsInBounds | None,
         robots: Sequence[str] | None,
         features: Sequence[str] | None,
+        family: str,
         memory: str = "level",
     ) -> None:
         """Read the arguments of a subclass; values that are None are left out.
 
         Raises:
-            TrustboError: If a value is not a number, is infinite or exceeds 1e12, or if sizes,
-                labels or names differ. Effects of places may be NaN where a map has no bound.
+            TrustboError: If a value is not a number, is infinite or exceeds 1e12, if sizes, labels
+                or names differ, or if the family is unknown. Effects of places may be NaN where a
+                map has no bound.
         """
+        require_choice("family", family, FAMILIES)
         own_robots = as_names("robots", robots or ()) or None
         own_features = as_names("features", features or ()) or None
         names = {"robot": own_robots, "robot_": own_robots, "feature": own_features}
         given = {name: value for name, value in values.items() if value is not None}
         arrays = _arrays_of(given, self.dims, names)
-        Draws.__init__(self, arrays, None, place_robot, own_robots, own_features, memory)
+        Draws.__init__(self, arrays, None, place_robot, own_robots, own_features, memory, family)
 
     @property
     def arguments(self) -> dict[str, Any]:
         """Arguments that make these parameters."""
-        others = ("place_robot", "robots", "features")
+        others = ("place_robot", "robots", "features", "family")
         return {**self.arrays, **{name: getattr(self, name) for name in others}}
 
     def replace(self, **changes: Any) -> Self:
@@ -95,10 +99,13 @@ class TrustParams(LinearParams):
         f_v: Floor of the scale of the observation noise (see `Priors.f_v`), or None for noise that
             is the same in all bounds. Predictions of rates then need names of features, of which
             one is line of sight.
+        family: Observation family of the contact rates, `"gaussian"`, `"censored"` or
+            `"beta_binomial"`; see `PooledTrust`. Parameters of a posterior have that of its model.
 
     Raises:
-        TrustboError: If a value is not a number, is infinite or exceeds 1e12, or if sizes or names
-            differ. An array with labels needs the names `robots` or `features`.
+        TrustboError: If a value is not a number, is infinite or exceeds 1e12, if sizes or names
+            differ, or if the family is unknown. An array with labels needs the names `robots` or
+            `features`.
 
     Example:
         >>> beta = np.array([0.1, 0.1, 0.3])  # of traversability, visibility and line of sight
@@ -125,6 +132,7 @@ class TrustParams(LinearParams):
         robots: Sequence[str] | None = None,
         features: Sequence[str] | None = None,
         f_v: Numbers | None = None,
+        family: str = "gaussian",
     ) -> None:
         values = {
             "beta0": beta0,
@@ -139,7 +147,7 @@ class TrustParams(LinearParams):
             "delta_s": delta_s,
             "f_v": f_v,
         }
-        self._set(values, place_robot, robots, features, memory)
+        self._set(values, place_robot, robots, features, family, memory)
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -204,6 +212,7 @@ class CoupledParams(LinearParams):
         place_robot: RobotsInBounds | None = None,
         robots: Sequence[str] | None = None,
         features: Sequence[str] | None = None,
+        family: str = "gaussian",
     ) -> None:
         values = {
             "B0": B0,
@@ -216,7 +225,7 @@ class CoupledParams(LinearParams):
             "place": place,
             "place_bound": place_bound,
         }
-        self._set(values, place_robot, robots, features)
+        self._set(values, place_robot, robots, features, family)
         for name in ("Delta_w", "Delta_v"):
             _require_covariance(name, self.arrays[name])
 

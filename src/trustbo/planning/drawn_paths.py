@@ -91,9 +91,9 @@ class DrawnPaths:
         problem = self.problem
         z, bounds = problem.along(path)
         recursion = trust_recursion(draws, z, problem.initial_trust(None), bounds=bounds)
-        along = capped(problem.objective, problem.likelihood, recursion)
+        along = capped(problem.objective, recursion)
         trust = states_along(along).mean(-1)
-        value = problem.value_along(problem.bound_cost_along(path), trust, along.noise_sd)
+        value = problem.value_along(problem.bound_cost_along(path), trust, along)
         return value - problem.failure_along(path)
 
     @cached_property

@@ -68,14 +68,14 @@ def _value_along(
     by_robot = trust_recursion(params, z, x0, bounds=bounds, by_robot=True)
     trust = states_along(by_robot)
     bound_cost = problem.bound_cost_along(path)
-    values = problem.value_along(bound_cost, trust.mean(-1), by_robot.noise_sd)
+    values = problem.value_along(bound_cost, trust.mean(-1), by_robot)
     if not problem.objective.of_contact:
-        value = problem.value_along(bound_cost, trust.mean((0, -1)), by_robot.noise_sd)
+        value = problem.value_along(bound_cost, trust.mean((0, -1)), by_robot)
         return trust, float(value), values
 
     # Capping the trust of each draw causes bias, so the value of each draw uses uncapped trust.
     # However, the contact lost on a path cannot be negative.
     team = by_robot if params.by_robot else by_robot.of_team()
-    team = capped(problem.objective, problem.likelihood, team)
-    mean = problem.value_along(bound_cost, states_along(team).mean(-1), team.noise_sd).mean()
+    team = capped(problem.objective, team)
+    mean = problem.value_along(bound_cost, states_along(team).mean(-1), team).mean()
     return trust, float(mean), np.minimum(values, -bound_cost)

@@ -22,7 +22,7 @@ def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph | nx.MultiDiGraph:
             "Give other parameters, or use `plan` to find a path."
         )
 
-    contact = capped(LOST_CONTACT, problem.likelihood, recursion)
+    contact = capped(LOST_CONTACT, recursion)
     workspace = problem.paths.workspace
     grid = workspace.grid
     n_posts = workspace.n_posts
@@ -35,7 +35,7 @@ def graph_of(problem: Problem, mean: Draws) -> nx.DiGraph | nx.MultiDiGraph:
 
     trust = of_bounds(recursion.steady_state()[0])
     of_contact = of_bounds(contact.steady_state()[0])
-    rate = problem.likelihood.mean_rate(of_contact, recursion.noise_sd)
+    rate = recursion.likelihood.mean_rate(of_contact, recursion.noise_sd)
     bound_cost = for_sets(problem.bound_cost, n_posts)
     lost = of_bounds(bound_cost) + np.maximum(1.0 - rate, 0.0)  # without rounding
     cost, constant = problem.costs_of_bounds(trust, lost)

@@ -114,14 +114,14 @@ def has_history(objective: Objective, likelihood: Family) -> bool:
     return objective.of_contact and likelihood.expected_rate != "identity"
 
 
-def capped(objective: Objective, likelihood: Family, recursion: Recursion) -> Recursion:
+def capped(objective: Objective, recursion: Recursion) -> Recursion:
     """Cap the drift and the initial trust, so that trust never exceeds 1 and no rate exceeds 1.
 
     If the drift of each state is at most 1 minus the row sum of B0, B0 >= 0 and x_0 <= 1, trust is
     at most 1. A loop then never increases the value. The cap is needed only for lost_contact with
     rates that are linear in trust; otherwise, the recursion is returned unchanged.
     """
-    if not objective.of_contact or has_history(objective, likelihood):
+    if not objective.of_contact or has_history(objective, recursion.likelihood):
         return recursion
 
     most = 1.0 - recursion.transition.sum(-1)

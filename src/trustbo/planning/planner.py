@@ -28,7 +28,6 @@ from trustbo.hazard.given import GivenRisk, read_risk
 from trustbo.hazard.risk import BoundRisk
 from trustbo.kernels import stopwatch
 from trustbo.models.draws import Draws
-from trustbo.models.families import FAMILIES
 from trustbo.parallel import computing
 from trustbo.planning.drawn_paths import DrawnPaths, choose_draws, drawn_paths
 from trustbo.planning.evaluation import evaluated
@@ -72,7 +71,6 @@ class Planner(Summary):
         bound_cost: ArrayLike = 0.0,
         max_failure: float | None = None,
         failure_cost: float | None = None,
-        family: str = "gaussian",
     ) -> None:
         """Check the arguments and find the admissible paths.
 
@@ -95,8 +93,6 @@ class Planner(Summary):
                 bounds of a path, so a failed mission counts as a mission without contact. If this
                 or `max_failure` is given, and `with_risk` is not called, plans have the failure
                 probabilities of the posterior of a campaign (its group `hazard`).
-            family: Name of the trust model's observation family, used only for contact rates, as
-                in lost_contact. A posterior with trust on another scale is refused.
 
         Raises:
             TrustboError: If the start or goal is off the grid or impassable; the start equals the
@@ -105,13 +101,12 @@ class Planner(Summary):
             NoPathError: If the goal cannot be reached from the start.
         """
         aim = OBJECTIVES[require_choice("objective", objective, OBJECTIVES)]
-        rates = FAMILIES[require_choice("family", family, FAMILIES)]
         if max_bounds is None:
             max_bounds = aim.max_bounds
 
         paths = AdmissiblePaths(workspace, start, goal, max_bounds)
         bound_cost = _bound_cost_of(bound_cost, paths.bounds)
-        self.problem = Problem(paths, aim, rates, bound_cost, max_failure, failure_cost)
+        self.problem = Problem(paths, aim, bound_cost, max_failure, failure_cost)
 
     def _rows(self) -> Rows:
         problem = self.problem
@@ -120,7 +115,6 @@ class Planner(Summary):
             ("from", f"{self.start} to {self.goal}"),
             ("objective", problem.objective.name),
             ("paths", f"{paths.shortest} to {paths.longest} bounds ({paths.max_bounds})"),
-            ("rates", problem.likelihood.name),
             ("risk", "given for each bound" if problem.risk is not None else "not given"),
         ]
 
@@ -310,7 +304,6 @@ class Planner(Summary):
             InfeasibleError: If no path respects `max_failure`.
         """
         problem = self._informed_by(params).problem
-        problem.require_family(params)
         with stopwatch() as elapsed:
             mean, draws = mean_and_draws_of(params, self.workspace)
             score, limits, paths = problem.best(problem.searched(mean, x0))
@@ -350,7 +343,6 @@ class Planner(Summary):
             InfeasibleError: If no path respects `max_failure`.
         """
         problem = self._informed_by(posterior).problem
-        problem.require_family(posterior)
         ahead = draws_of(posterior, self.workspace)
         return drawn_paths(problem, choose_draws(ahead.expected, n_draws, seed))
 
@@ -373,7 +365,6 @@ class Planner(Summary):
                 workspace, or if the path has gaps or does not lead from start to goal.
         """
         problem = self._informed_by(params).problem
-        problem.require_family(params)
         path = self.require_path(path)
         draws = draws_of(params, self.workspace).drawn
         return evaluated(problem, path, draws, None, x0)
@@ -400,7 +391,6 @@ class Planner(Summary):
         """
         path = self.require_path(path)
         problem = self._informed_by(params).problem
-        problem.require_family(params)
         mean = mean_of(params, self.workspace)
 
         rows = []
@@ -455,7 +445,6 @@ class Planner(Summary):
             >>> of_two = tb.Planner(two, planner.start, planner.goal)
             >>> of_two.watchers(plan.path, posterior, missions=[mission]).mean()
         """
-        self.problem.require_family(params, uses_rates=True)
         path = self.require_path(path)
         seed = require_whole("seed", seed, 0)
         draws = draws_of(params, self.workspace).drawn
@@ -505,7 +494,6 @@ class Planner(Summary):
             TrustboError: If abs(beta0) >= 1, because trust would then grow without limit.
         """
         problem = self._informed_by(params).problem
-        problem.require_family(params, uses_rates=True)
         return graph_of(problem, mean_of(params, self.workspace))
 
     @computing()
@@ -556,11 +544,9 @@ class Planner(Summary):
         """
         require_switch("as_rate", as_rate)
         require_switch("expected", expected)
-        self.problem.require_family(params, uses_rates=as_rate)
         draws = draws_of(params, self.workspace).of_robots(expected=expected)
-        family = self.problem.likelihood
         about = {"move": move, "posts": posts, "as_rate": as_rate}
-        return robot_trust(self.workspace, family, draws, robot, cell, **about)
+        return robot_trust(self.workspace, draws, robot, cell, **about)
 
     @computing()
     def robot_maps(self, posterior: Draws | xr.DataTree, *, expected: bool = False) -> xr.Dataset:
@@ -579,9 +565,8 @@ class Planner(Summary):
             the mean `contact_rate` of `trust(as_rate=True)`. Cells that no bound enters are NaN.
         """
         require_switch("expected", expected)
-        self.problem.require_family(posterior, uses_rates=True)
         draws = draws_of(posterior, self.workspace).of_robots(expected=expected)
-        return robot_maps(self.workspace, self.problem.likelihood, draws)
+        return robot_maps(self.workspace, draws)
 
     @computing()
     def trust_map(

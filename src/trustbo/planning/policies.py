@@ -76,7 +76,7 @@ def optimistic(
 
     some = choose_draws(params, _N_DRIFTS, _seed(rng))
     drawn = planner.problem.searched(some)
-    optimistic = Recursion(
+    optimistic = drawn._replace(
         transition=drawn.transition.mean(0, keepdims=True),
         drift=np.quantile(drawn.drift, quantile, axis=0, keepdims=True),
         start=drawn.start.mean(0, keepdims=True),
@@ -158,6 +158,7 @@ def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
         drift=rng.uniform(size=(1, 1, *shape)),
         start=np.zeros((1, 1)),
         noise_sd=np.full(1, 0.1),  # matters only for censored rates
+        likelihood=params.likelihood,
     )
     return planner.evaluate(planner.best_path(recursion), params.mean())
 

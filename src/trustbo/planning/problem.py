@@ -16,7 +16,6 @@ from trustbo.fixed import Uncached
 from trustbo.hazard.path_risk import ROUNDING, Risk
 from trustbo.inference.learner import next_mission_of
 from trustbo.models.draws import Draws, NextMission
-from trustbo.models.families import FAMILIES, Family
 from trustbo.planning.labels import best_labels
 from trustbo.planning.limits import LOGISTIC, LOSSES, TINY_SD, Costs
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
@@ -76,7 +75,6 @@ class Problem(Uncached):
     Attributes:
         paths: Admissible paths.
         objective: One of the objectives in `OBJECTIVES`.
-        likelihood: Observation family of the contact rates.
         bound_cost: Additional cost of each bound, shape (move, row, col).
         max_failure: Largest failure probability allowed for a path, or None for no limit.
         failure_cost: Cost of a failure in bounds, or None for the smallest number of bounds of a
@@ -88,7 +86,6 @@ class Problem(Uncached):
 
     paths: AdmissiblePaths
     objective: Objective
-    likelihood: Family
     bound_cost: np.ndarray
     max_failure: float | None = None
     failure_cost: float | None = None
@@ -123,31 +120,6 @@ class Problem(Uncached):
             return float(self.paths.shortest)
         return self.failure_cost
 
-    def require_family(self, given: Draws | xr.DataTree, *, uses_rates: bool | None = None) -> None:
-        """Check that contact rates are computed from the trust of a posterior on the right scale.
-
-        Args:
-            given: Posterior, or parameters, whose family is not known.
-            uses_rates: Whether contact rates are computed; by default, whether the objective
-                measures contact.
-
-        Raises:
-            TrustboError: If trust is a logit in the posterior but not in the planner's family, or
-                the reverse.
-        """
-        if uses_rates is None:
-            uses_rates = self.objective.of_contact
-        if not uses_rates or not isinstance(given, xr.DataTree):
-            return
-
-        fitted = FAMILIES.get(str(given.attrs.get("family")), self.likelihood)
-        logits = [row.expected_rate == "logistic" for row in (fitted, self.likelihood)]
-        if logits[0] != logits[1]:
-            raise TrustboError(
-                f"the posterior has the family {fitted.name!r}, but the planner has the family "
-                f"{self.likelihood.name!r}; use Planner(..., family={fitted.name!r})."
-            )
-
     def along(self, path: Sequence[Station] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the awareness (robot, bound, feature) and the bounds (bound, 3) of a path."""
         pairs = pairs_along(path, self.paths.workspace.n_posts)
@@ -157,15 +129,15 @@ class Problem(Uncached):
         """Sum the costs of the bounds of a path."""
         return float(self.bound_cost[moves_along(path), *cells_along(path)[1:].T].sum())
 
-    def value_along(self, bound_cost: float, trust: np.ndarray, noise_sd: np.ndarray) -> np.ndarray:
+    def value_along(self, bound_cost: float, trust: np.ndarray, along: Recursion) -> np.ndarray:
         """Compute the value of a path, shape (...,), assuming that no bound fails.
 
         `bound_cost` is the sum over the path. The team's `trust` after each bound has shape (...,
-        bound), and `noise_sd` has shape (...,).
+        bound), and `along` is its recursion, of which only the noise and the family are used.
         """
         objective = self.objective
         if objective.of_contact:
-            lost = 1.0 - self.likelihood.mean_rate(trust, noise_sd[..., None])
+            lost = 1.0 - along.likelihood.mean_rate(trust, along.noise_sd[..., None])
             return objective.value(-lost.sum(-1) - bound_cost)
 
         n_bounds = trust.shape[-1]
@@ -303,9 +275,9 @@ class Problem(Uncached):
             TrustboError: If beta0 is outside the range in which the search is exact.
             InfeasibleError: If no path respects `max_failure`.
         """
-        history = has_history(self.objective, self.likelihood)
+        history = has_history(self.objective, recursion.likelihood)
         self._require_valid(recursion, history)
-        recursion = capped(self.objective, self.likelihood, recursion)
+        recursion = capped(self.objective, recursion)
 
         graph = self.paths.graph
         bound_cost = self.bound_cost.ravel()
@@ -328,7 +300,7 @@ class Problem(Uncached):
         loss = LOGISTIC  # not used, because trust is not tracked
         if history:  # the cost depends on trust itself and is not a weighted sum of drifts
             n_trust = n_states
-            loss = LOSSES[self.likelihood.expected_rate]
+            loss = LOSSES[recursion.likelihood.expected_rate]
             weights = Weights(0.0 * weights.per_bound, 0.0 * weights.constant, weights.scale)
 
         risks = self.edge_risks or EdgeRisks(

@@ -10,6 +10,7 @@ from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Cell
 from trustbo.errors import TrustboError, require_kind
 from trustbo.models.draws import Draws
+from trustbo.models.families import Family
 from trustbo.statespace import kalman
 from trustbo.workspace.moves import bounds_along
 
@@ -23,13 +24,14 @@ class Recursion(NamedTuple):
     robots share. Each robot is a state, and the team's trust is the mean of the states. If all
     robots have the same beta0, the mean trust is the only state. The drift at (move, row, col)
     belongs to the bound that enters the cell by that move; the drift is NaN if there is no such
-    bound.
+    bound. `likelihood` is the observation family of the rates.
     """
 
     transition: np.ndarray
     drift: np.ndarray
     start: np.ndarray
     noise_sd: np.ndarray
+    likelihood: Family
 
     def of_team(self) -> "Recursion":
         """Return the recursion of the mean trust of robots that obey the same equation."""
@@ -102,8 +104,8 @@ def trust_recursion(
     noise_sd = space.rate_sd.mean((1, 2))
     if draws.by_robot or by_robot:
         drift = draws.inputs(awareness, bounds)
-        shape = (n_draws, n_robots, *drift.shape[2:])
-        return Recursion(transition, np.broadcast_to(drift, shape), start, noise_sd)
+        drift = np.broadcast_to(drift, (n_draws, n_robots, *drift.shape[2:]))
+        return Recursion(transition, drift, start, noise_sd, draws.likelihood)
 
     # With a common beta0, the mean trust of the robots obeys the same equation.
     return Recursion(
@@ -111,6 +113,7 @@ def trust_recursion(
         drift=draws.team_inputs(awareness, bounds),
         start=start.mean(-1, keepdims=True),
         noise_sd=noise_sd,
+        likelihood=draws.likelihood,
     )
 
 

@@ -15,7 +15,6 @@ import xarray as xr
 from trustbo.data import POST_SETS
 from trustbo.errors import TrustboError, require_choice, warn
 from trustbo.models.draws import Draws
-from trustbo.models.families import Family
 from trustbo.planning.recursion import trust_recursion
 from trustbo.workspace import Workspace
 from trustbo.workspace.grid import Location
@@ -56,7 +55,6 @@ class Bounds(NamedTuple):
 
 def robot_trust(
     workspace: Workspace,
-    family: Family,
     draws: Draws,
     robot: str | None = None,
     cell: Location | None = None,
@@ -75,7 +73,7 @@ def robot_trust(
     index = [names.index(name) for name in chosen]
     means = []
     for part, trust in _stationary(bounds, draws):
-        of_bounds = _rate_of(trust, family, part) if as_rate else trust
+        of_bounds = _rate_of(trust, part) if as_rate else trust
         means.append(bounds.mean(of_bounds)[:, index])
     values = np.concatenate(means)
     _warn_of_draws(np.isnan(values).all((1, 2)))
@@ -101,7 +99,7 @@ def robot_trust(
     return trust.rename("trust").assign_attrs(long_name="stationary trust")
 
 
-def robot_maps(workspace: Workspace, family: Family, draws: Draws) -> xr.Dataset:
+def robot_maps(workspace: Workspace, draws: Draws) -> xr.Dataset:
     """Summarise stationary trust in each robot over draws; see `Planner.robot_maps`."""
     bounds = _bounds_of(workspace, None, None, POST_SETS[0])
     shape = (workspace.team.n_robots, bounds.n_targets)
@@ -115,7 +113,7 @@ def robot_maps(workspace: Workspace, family: Family, draws: Draws) -> xr.Dataset
     # cancellation.
     for part, of_bounds in _stationary(bounds, draws):
         trust = bounds.mean(of_bounds)
-        rate = bounds.mean(_rate_of(of_bounds, family, part))
+        rate = bounds.mean(_rate_of(of_bounds, part))
 
         is_diverging = np.isnan(trust).all((1, 2))
         diverging.append(is_diverging)
@@ -201,11 +199,11 @@ def _stationary(bounds: Bounds, draws: Draws) -> Iterator[tuple[Draws, np.ndarra
         yield part, np.where(diverges, np.nan, recursion.steady_states())
 
 
-def _rate_of(trust: np.ndarray, family: Family, draws: Draws) -> np.ndarray:
+def _rate_of(trust: np.ndarray, draws: Draws) -> np.ndarray:
     """Compute the expected contact rate, limited to [0, 1], at trust (draw, robot, bound)."""
     space = draws.state_space(trust.shape[1])
     sd = space.rate_sd.reshape(len(trust), -1)  # (draw, robot), or one for all robots
-    return np.clip(family.mean_rate(trust, sd[:, :, None]), 0.0, 1.0)
+    return np.clip(draws.likelihood.mean_rate(trust, sd[:, :, None]), 0.0, 1.0)
 
 
 def _warn_of_draws(diverging: np.ndarray) -> None:

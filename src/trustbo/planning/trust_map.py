@@ -31,8 +31,9 @@ def trust_map(
     recursion = problem.recursion(params, x0, by_robot=per_robot)
     if led:
         of_mean = problem.recursion(params.mean(), x0, by_robot=per_robot)
-        both = zip(of_mean, recursion, strict=True)
-        recursion = Recursion(*(np.concatenate(pair) for pair in both))
+        arrays = zip(Recursion._fields[:-1], of_mean[:-1], recursion[:-1], strict=True)
+        both = {name: np.concatenate([first, others]) for name, first, others in arrays}
+        recursion = recursion._replace(**both)
 
     like = problem.paths.workspace.awareness.isel(move=0, feature=0, drop=True)
     n_states = recursion.start.shape[-1]

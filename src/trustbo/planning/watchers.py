@@ -127,7 +127,7 @@ def drawn_rates(problem: Problem, path: Sequence[Station], draws: Draws, seed: i
     n_robots = len(z)
     draws.require_valid(n_robots, z.shape[-1])
     draws.require_grid(problem.paths.bounds.shape[1:])
-    space = draws.state_space(n_robots, adds_noise=problem.likelihood.adds_noise)
+    space = draws.state_space(n_robots, adds_noise=draws.likelihood.adds_noise)
     inputs = draws.along(z, bounds, space)
 
     index = np.tile(np.arange(draws.n_draws), -(-_FEWEST // draws.n_draws))
@@ -143,7 +143,7 @@ def drawn_rates(problem: Problem, path: Sequence[Station], draws: Draws, seed: i
 
     rng = stream(seed, "watchers")
     n_ticks = [space.grouped(np.full(n_robots, _TICKS))] * len(inputs)
-    ahead = kalman.forecast(space, belief, inputs, n_ticks, problem.likelihood, rng)
+    ahead = kalman.forecast(space, belief, inputs, n_ticks, draws.likelihood, rng)
     return np.stack([rates for _, rates in ahead], axis=1)
 
 

@@ -312,7 +312,8 @@ def draws_of_drift(
         names = ("beta", "b", *PLACES)
         arrays |= {name: linear.arrays[name] for name in names if name in linear.arrays}
         in_bounds = linear.place_robot
-    return Draws(arrays, drift, in_bounds, drift.robots, drift.features)
+    family = drift.model.family
+    return Draws(arrays, drift, in_bounds, drift.robots, drift.features, family=family)
 
 
 def no_weights(theta: Mapping[str, np.ndarray], features: Names) -> dict[str, np.ndarray]:
