@@ -72,7 +72,7 @@ FAULTS = (
           "whole - fitted.without(j).log_evidence(theta)",
           "fitted.without(j).log_evidence(theta) - whole"),
     Fault("a bound that failed is also counted as passed", "hazard/risk.py",
-          "b += trials - failed", "b += trials"),
+          "b += trials - failures", "b += trials"),
     Fault("the margin raises the slope limit", "hazard/prior.py",
           "(steepness[j] + limit[i, 0])", "(steepness[j] - limit[i, 0])"),
     Fault("the loss of a bound is clipped a second time", "planning/problem.py",

@@ -1,4 +1,19 @@
-"""Posterior failure probabilities of bounds and paths, for planning."""
+"""Posterior failure probabilities of bounds and paths, for planning.
+
+The group `hazard` of a posterior contains draws of hyperparameters, and what happened in bounds.
+For each draw, the failure probability of a bound has a Beta distribution, which follows in three
+steps:
+
+1. The prior Beta(a, b) depends on the difficulty of the bound, through the weights of the measures
+   of difficulty and the slope limit.
+2. A failure at this bound adds 1 to a, and each time that it was passed adds 1 to b.
+3. A mission that was lost in an unknown bound of its path is counted as in step 2, for the bound
+   that the draw assumes.
+
+All means are averages over the draws. Bounds that pass or fail together are one unit, and have the
+same probability, so the steps are taken once for each unit (see `hazard.units`). Results are maps
+by way and next way, as planners read them (see `workspace.moves`).
+"""
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -14,16 +29,17 @@ from trustbo.errors import TrustboError, require_whole
 from trustbo.hazard.components import Components, partition
 from trustbo.hazard.path_risk import BAND, PathRisk, Risk
 from trustbo.hazard.prior import LIMIT_NAMES, REFERENCE, prior_betas, steepness_of
+from trustbo.hazard.units import Units
 from trustbo.workspace import Workspace
-from trustbo.workspace.difficulty import TILT
-from trustbo.workspace.moves import by_option, by_way, next_names, way_names
+from trustbo.workspace.difficulty import TILT, Difficulty
+from trustbo.workspace.moves import by_option, next_names, way_names
 
 _DIMS = ("draw", "lost", "measure", "bound", "axis", "move", "row", "col", "next_move")
 """Axes of the group `hazard`, in order."""
 _ENTRIES = 1 << 17
-"""Maximum size of an array (draw, bound), which fits into the cache of a core."""
+"""Maximum size of an array (draw, unit), which fits into the cache of a core."""
 _SOME = 256
-"""Approximate number of bounds whose mean failure probability determines the order of the draws."""
+"""Approximate number of units whose mean failure probability determines the order of the draws."""
 
 
 class BoundRisk(Risk):
@@ -56,58 +72,32 @@ class BoundRisk(Risk):
                 measures of difficulty are not those of the workspace.
         """
         difficulty = workspace.difficulty
-        shape = difficulty.exists.shape
-        labels = {
-            "draw": None,  # numbers
-            "axis": _DIMS[-4:],
-            "move": way_names(workspace.n_posts),
-            "next_move": next_names(workspace.n_posts),
-        }
-        hazard = in_order("the hazard posterior", hazard, labels)
-        hazard = hazard.transpose(*_DIMS, missing_dims="ignore")
-        if hazard["trials"].shape != shape:
-            raise TrustboError(
-                f"the hazard posterior has trials of the shape {hazard['trials'].shape}; for this "
-                f"workspace, it must be (move, row, col, next_move) = {shape}. Call fit_hazard "
-                "again with the missions; posteriors of trustbo 0.4 have no next moves."
-            )
+        hazard = _in_order(hazard, workspace.n_posts)
+        _require_same_bounds(hazard, difficulty.exists)
+        _require_measures(hazard, difficulty)
 
+        # What happened.
         self.exists = difficulty.exists
-        if "is_bound" in hazard and (hazard["is_bound"].values != self.exists.any(-1)).any():
-            raise TrustboError(
-                "the hazard posterior has other bounds than this workspace; call fit_hazard "
-                "again with this workspace."
-            )
-
-        names = hazard["measure"].values.tolist()
-        if set(names) - set(difficulty.measures):
-            raise TrustboError(
-                f"the hazard posterior needs the measures of difficulty {', '.join(names)}, which "
-                "a workspace without a terrain does not have; call fit_hazard again with this "
-                "workspace."
-            )
-
         self.trials = hazard["trials"].values
         self.failures = hazard["failures"].values
-        self._counts = by_option(self.failures), by_option(self.trials)
+        self._trials_of_options = by_option(self.trials)
+        self._failures_of_options = by_option(self.failures)
+        self._lost = [path[path[:, 0] >= 0] for path in hazard["lost_bound"].values]  # (bound, 4)
+        self._place = hazard["place"].values  # of the failure in a lost path, (draw, lost), from 1
+
+        # Difficulty.
         self._difficulty = difficulty
         self._n_posts = workspace.n_posts
-        self._measures = [difficulty.measures.index(name) for name in names]
+        self._measures = [difficulty.measures.index(name) for name in hazard["measure"].values]
         self._max_slope = workspace.team.max_slope
 
-        limit = [n for n in LIMIT_NAMES if n in hazard]
-        self._has_limit = bool(limit)
-        self._strength = hazard["strength"].values  # (draw,)
+        # Hyperparameters.
         intercept = hazard["intercept"].values[:, None]
-        coefficient = hazard["coefficient"].values
-        self._weights = np.concatenate([intercept, coefficient], axis=1)  # (draw, 1 + measure)
-
-        of_draws = [hazard[name].values for name in limit]
-        self._limit = np.reshape(of_draws, (len(limit), len(self._strength))).T
-
-        # Ways and next ways of each lost mission, (bound, 4).
-        self._lost = [path[path[:, 0] >= 0] for path in hazard["lost_bound"].values]
-        self._place = hazard["place"].values  # (draw, lost), from 1
+        self._weights = np.concatenate([intercept, hazard["coefficient"].values], axis=1)
+        self._strength = hazard["strength"].values  # (draw,)
+        limit = [hazard[name].values for name in LIMIT_NAMES if name in hazard]
+        self._has_limit = bool(limit)
+        self._limit = np.reshape(limit, (len(limit), len(self._strength))).T  # (draw, parameter)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -145,43 +135,17 @@ class BoundRisk(Risk):
         return steepness_of(tilt, self._max_slope)
 
     @cached_property
-    def _unit(self) -> np.ndarray:
-        """First option of each option's unit, shape (move, row, col, option); -1 if none."""
-        return by_option(self._difficulty.whole().unit)
-
-    @cached_property
-    def _units(self) -> np.ndarray:
-        """All units as bounds with their first option, shape (unit, 4)."""
-        return np.argwhere(self._unit == np.arange(self._unit.shape[-1]))
-
-    @cached_property
-    def _number(self) -> np.ndarray:
-        """Index of each option's unit in `_units`, (move, row, col, option); -1 if none."""
-        first = self._unit
-        number = np.full(first.shape, -1)
-        number[*self._units.T] = np.arange(len(self._units))
-        of_first = np.take_along_axis(number, np.maximum(first, 0), -1)
-        return np.where(first >= 0, of_first, -1)
-
-    def _maps(self, values: np.ndarray) -> np.ndarray:
-        """Return values (..., unit) as maps (..., way, row, col, next_way)."""
-        nowhere = np.full((*values.shape[:-1], 1), np.nan)
-        values = np.concatenate([values, nowhere], axis=-1)
-
-        of_bounds = self._number.max(-1)
-        if ((self._number == of_bounds[..., None]) | (self._unit < 0)).all():  # without a terrain
-            maps = values[..., of_bounds]
-            maps = np.broadcast_to(maps[..., None], (*maps.shape, self._number.shape[-1]))
-            return by_way(maps, self._n_posts)
-        return values[..., by_way(self._number, self._n_posts)]
+    def _units(self) -> Units:
+        """Units of all bounds, which are measured now if they were not before."""
+        return Units(self._difficulty.whole().unit, self._n_posts)
 
     @cached_property
     def mean(self) -> np.ndarray:
         """Posterior mean of the failure probability, shape (way, row, col, next_way)."""
-        mean = np.empty(len(self._units))
+        mean = np.empty(len(self._units.named))
         for units, a, b in self._betas():
             mean[units] = (a / (a + b)).mean(0)
-        return self._maps(mean)
+        return self._units.on_maps(mean)
 
     @cached_property
     def past_failures(self) -> np.ndarray:
@@ -208,10 +172,10 @@ class BoundRisk(Risk):
         steps = (np.arange(require_whole("n", n, 1)) + 0.5) / n
         chosen = rng.permutation(order[(steps * len(order)).astype(int)])
 
-        out = np.empty((n, len(self._units)))
+        out = np.empty((n, len(self._units.named)))
         for units, a, b in self._betas(chosen):
             out[:, units] = rng.beta(a, b)
-        return self._maps(out)
+        return self._units.on_maps(out)
 
     def components(self, n: int = 5) -> Components:
         """Average the failure probabilities in at most `n` groups of draws (see `Components`).
@@ -227,10 +191,10 @@ class BoundRisk(Risk):
         # One product averages over the members of each group.
         weights = (member == np.arange(len(ends))[:, None]) / sizes[:, None]
 
-        p_fail = np.empty((len(ends), len(self._units)))
+        p_fail = np.empty((len(ends), len(self._units.named)))
         for units, a, b in self._betas():
             p_fail[:, units] = weights @ (a / (a + b))
-        return Components(self._maps(p_fail), sizes / sizes.sum())
+        return Components(self._units.on_maps(p_fail), sizes / sizes.sum())
 
     @cached_property
     def searched(self) -> Components:
@@ -267,49 +231,97 @@ class BoundRisk(Risk):
     @cached_property
     def _severity(self) -> np.ndarray:
         """Mean failure probability (draw,) over a subset of units for each hyperparameter draw."""
-        a, b = self._betas_of(self._units[:: 1 + len(self._units) // _SOME])
+        named = self._units.named
+        a, b = self._betas_of(named[:: 1 + len(named) // _SOME])
         return (a / (a + b)).mean(1)
 
     def _betas(self, draws: Any = slice(None)) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
         """Yield chunks of all units: their slice, and alpha and beta (draw, unit)."""
+        named = self._units.named
         n_draws = len(self._strength[draws])
         step = max(1, _ENTRIES // n_draws)
-        for start in range(0, len(self._units), step):
-            units = slice(start, start + step)
-            yield units, *self._betas_of(self._units[units], draws)
+        for start in range(0, len(named), step):
+            some = slice(start, start + step)
+            yield some, *self._betas_of(named[some], draws)
 
     def _betas_of(
         self, units: np.ndarray, draws: Any = slice(None)
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return alpha and beta (draw, unit) of the posterior Beta distributions of units.
 
-        Units (unit, 4) are distinct bounds with the first option of the unit.
+        The units (unit, 4) are named as in `Units`, and distinct.
         """
-        bounds = units[:, :3]
-        of_unit = np.arange(len(units)), units[:, 3]
-        difficulty = self._difficulty.of(bounds)
-        measures = difficulty.values[of_unit]
-        a, b = prior_betas(
+        difficulty = self._difficulty.of(units[:, :3])
+        measures = difficulty.values[np.arange(len(units)), units[:, 3]]
+        a, b = self._prior_of(measures, draws)
+
+        is_member = difficulty.unit == units[:, 3:]  # (unit, option)
+        failures = _total(self._failures_of_options, units, is_member)
+        trials = _total(self._trials_of_options, units, is_member)
+        a += failures
+        b += trials - failures
+
+        number = {unit: k for k, unit in enumerate(map(tuple, units.tolist()))}
+        for j, path in enumerate(self._lost):
+            passed = self._difficulty.units_of(path).tolist()
+            numbers = np.array([number.get(tuple(unit), -1) for unit in passed])
+            add_lost(numbers, self._place[draws, j] - 1, a, b)
+        return a, b
+
+    def _prior_of(self, measures: np.ndarray, draws: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return alpha and beta (draw, unit) of the prior, given measures (unit, measure)."""
+        steepness = self._steepness_of(measures) if self._has_limit else None
+        return prior_betas(
             self._weights[draws],
             self._limit[draws],
             self._strength[draws],
             measures[:, self._measures] - REFERENCE,
-            self._steepness_of(measures) if self._has_limit else None,
+            steepness,
         )
 
-        member = difficulty.unit == units[:, 3:]  # (unit, option)
-        failed, trials = (
-            np.where(member, counts[*bounds.T], 0.0).sum(-1) for counts in self._counts
-        )
-        a += failed
-        b += trials - failed
 
-        position = {unit: k for k, unit in enumerate(map(tuple, units.tolist()))}
-        for j, path in enumerate(self._lost):
-            of_path = self._difficulty.units_of(path)
-            at = [position.get(unit, -1) for unit in map(tuple, of_path.tolist())]
-            add_lost(np.array(at), self._place[draws, j] - 1, a, b)
-        return a, b
+def _in_order(hazard: xr.Dataset, n_posts: int) -> xr.Dataset:
+    """Return the group `hazard` with its axes and labels in order."""
+    labels = {
+        "draw": None,  # numbers
+        "axis": _DIMS[-4:],
+        "move": way_names(n_posts),
+        "next_move": next_names(n_posts),
+    }
+    hazard = in_order("the hazard posterior", hazard, labels)
+    return hazard.transpose(*_DIMS, missing_dims="ignore")
+
+
+def _require_same_bounds(hazard: xr.Dataset, exists: np.ndarray) -> None:
+    """Raise TrustboError unless the bounds of the hazard posterior are those of the workspace."""
+    if hazard["trials"].shape != exists.shape:
+        raise TrustboError(
+            f"the hazard posterior has trials of the shape {hazard['trials'].shape}; for this "
+            f"workspace, it must be (move, row, col, next_move) = {exists.shape}. Call fit_hazard "
+            "again with the missions; posteriors of trustbo 0.4 have no next moves."
+        )
+    if "is_bound" in hazard and (hazard["is_bound"].values != exists.any(-1)).any():
+        raise TrustboError(
+            "the hazard posterior has other bounds than this workspace; call fit_hazard "
+            "again with this workspace."
+        )
+
+
+def _require_measures(hazard: xr.Dataset, difficulty: Difficulty) -> None:
+    """Raise TrustboError if the hazard posterior needs measures that the workspace lacks."""
+    names = hazard["measure"].values.tolist()
+    if set(names) - set(difficulty.measures):
+        raise TrustboError(
+            f"the hazard posterior needs the measures of difficulty {', '.join(names)}, which "
+            "a workspace without a terrain does not have; call fit_hazard again with this "
+            "workspace."
+        )
+
+
+def _total(counts: np.ndarray, units: np.ndarray, is_member: np.ndarray) -> np.ndarray:
+    """Add up counts (move, row, col, option) over the options of each unit, shape (unit,)."""
+    of_bounds = counts[*units[:, :3].T]  # (unit, option)
+    return np.where(is_member, of_bounds, 0.0).sum(-1)
 
 
 def add_lost(path: np.ndarray, place: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
