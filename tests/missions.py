@@ -14,6 +14,7 @@ OF_FAMILY = {
     "censored": TrustParams(0.6, np.array([0.5, 0.3]), -0.1, 0.15, 0.1),
     "beta_binomial": TrustParams(0.6, np.array([2.0, 1.0]), -0.6, 0.4, 0.25, 0.0, 1.5),
 }
+OF_FAMILY = {name: params.replace(family=name) for name, params in OF_FAMILY.items()}
 
 
 def draw_rates(params, awareness, *, family="gaussian", n_ticks=np.nan, seed=0):

@@ -66,7 +66,7 @@ def filter_of(campaign):
     model = campaign.model.for_features(campaign.workspace.features)
     seed = campaign.state.seed_of("prior")
     draws = sample_prior_ahead(model, campaign.workspace, 250, seed).drawn
-    return TrustFilter(draws, 3, family=model.family, workspace=campaign.workspace)
+    return TrustFilter(draws, 3, workspace=campaign.workspace)
 
 
 @pytest.mark.parametrize(

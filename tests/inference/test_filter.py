@@ -94,7 +94,7 @@ def test_a_censored_rate_after_others_inside_is_followed_exactly(kind, limit):
     params = draws_of(kind)
     z, y = mission_seen()
     y[-1, -1] = limit
-    live = TrustFilter(params, n_robots=3, family="censored")
+    live = TrustFilter(params.replace(family="censored"), n_robots=3)
     for k in range(len(z)):
         state = live.update(z[k], y[k], PATH[k : k + 2])
 
@@ -215,9 +215,9 @@ def test_families_are_followed_to_the_trust_of_a_grid(family):
     p = OF_FAMILY[family]
     other = p.replace(delta_w=1e-5, x0_sd=1e-5)
     z, y, _ = counted_missions(family)
-    live = TrustFilter(constant(p), n_robots=1, family=family)
+    live = TrustFilter(constant(p), n_robots=1)
     two = {name: np.concatenate([p.values[name], other.values[name]]) for name in p.values}
-    compared = TrustFilter(TrustParams(**two), n_robots=1, family=family)
+    compared = TrustFilter(TrustParams(**two, family=family), n_robots=1)
     for j in range(len(y)):
         live.reset()
         compared.reset()
@@ -237,7 +237,7 @@ def test_families_are_followed_to_the_trust_of_a_grid(family):
 
 
 def test_counts_need_their_numbers_of_ticks():
-    counting = TrustFilter(constant(OF_FAMILY["beta_binomial"]), 2, family="beta_binomial")
+    counting = TrustFilter(constant(OF_FAMILY["beta_binomial"]), 2)
     with pytest.raises(TrustboError, match="The beta-binomial family counts ticks"):
         counting.update(np.full((2, 2), 0.5), [1.0, 1.0])
     with pytest.raises(TrustboError, match="n_ticks"):
@@ -256,9 +256,10 @@ def test_coupled_robots_without_a_coupling_are_robots_apart(family):
         p.delta_v**2 * eye,
         p.x0_mean,
         p.x0_sd,
+        family=family,
     )
-    together = TrustFilter(coupled, family=family)
-    apart = TrustFilter(constant(p, 1), 2, family=family)
+    together = TrustFilter(coupled)
+    apart = TrustFilter(constant(p, 1), 2)
     for y in ([1.0, 0.5], [0.0, np.nan], [0.9, 1.0]):
         z = rng.uniform(size=(2, 2))
         one, other = (live.update(z, y, n_ticks=N_TICKS) for live in (together, apart))
@@ -280,7 +281,7 @@ def test_rates_ahead_have_the_interval_of_the_model():
     assert (np.abs(ahead.rate - ahead.mean) < error).all()
     assert (np.abs(ahead.rate_low - law.ppf(0.05)) < 2.2 * error).all()
     assert (np.abs(ahead.rate_high - law.ppf(0.95)) < 2.2 * error).all()
-    cut = TrustFilter(constant(OF_FAMILY["censored"], n), 2, family="censored", max_draws=n)
+    cut = TrustFilter(constant(OF_FAMILY["censored"], n), 2, max_draws=n)
     for _ in range(6):
         cut.update(np.ones((2, 2)), [1.0, 1.0])
     assert (cut.predict(np.ones((1, 2, 2))).rate_high == 1.0).all()

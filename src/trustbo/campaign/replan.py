@@ -55,12 +55,7 @@ def trust_filter(result: Result, workspace: Workspace) -> TrustFilter:
         result: Campaign.
         workspace: Workspace of the plan, whose team are the robots that take part.
     """
-    return TrustFilter(
-        result.forecast,
-        workspace.team.n_robots,
-        family=result.learner.family,
-        workspace=workspace,
-    )
+    return TrustFilter(result.forecast, workspace.team.n_robots, workspace=workspace)
 
 
 def follow(

@@ -14,7 +14,6 @@ from trustbo.inference.importance import systematic
 from trustbo.inference.learner import params_of
 from trustbo.inference.params import as_fitted
 from trustbo.models.draws import Draws
-from trustbo.models.families import FAMILIES
 from trustbo.models.observations import NO_TICKS
 from trustbo.parallel import computing
 from trustbo.statespace import Inputs, kalman
@@ -97,7 +96,6 @@ class TrustFilter:
         posterior: xr.DataTree | Draws,
         n_robots: int | None = None,
         *,
-        family: str = "gaussian",
         max_draws: int = 1000,
         workspace: Workspace | None = None,
     ) -> None:
@@ -106,7 +104,6 @@ class TrustFilter:
         Args:
             posterior: DataTree from `fit`, or draws of parameters.
             n_robots: Number of robots; needed only with `TrustParams`.
-            family: Observation family of parameter draws; ignored for a DataTree.
             max_draws: Maximum number of draws; if there are more, evenly spaced draws are selected.
             workspace: Workspace that determines the order of robots and features in all arrays. By
                 default, arrays without labels are in the order of the missions of the fit, or in
@@ -123,7 +120,6 @@ class TrustFilter:
             if "constant_data" in tree.children:  # without a map, any awareness is valid
                 self._bounded = bool((tree["constant_data"]["row"] >= 0).any())
             n_robots = tree.attrs["n_robots"] if workspace is None else None
-            family = tree.attrs["family"]
             posterior = params_of(tree, workspace, next_mission=True)
         elif not isinstance(posterior, Draws):
             raise TrustboError(
@@ -150,7 +146,7 @@ class TrustFilter:
         max_draws = require_whole("max_draws", max_draws, 1)
         kept = evenly_spaced(posterior.n_draws, max_draws)
         self.params: Draws = posterior.draw(kept)
-        self.likelihood = FAMILIES[family]
+        self.likelihood = self.params.likelihood
         self.space = self.params.state_space(self._n_robots, adds_noise=self.likelihood.adds_noise)
         self.reset()
 
