@@ -28,9 +28,7 @@ LOSSES = {"logistic": LOGISTIC, "clipped": CLIPPED}
 TINY_SD = 1e-9
 """Smallest standard deviation of a contact rate; smaller values are replaced."""
 _MAX_EXPONENT = 700.0  # exp(710) exceeds the range of a float
-_N_TANGENTS = 8  # maximum number of tangents to the failure cost; few suffice to find good paths
 _N_PRICES = 16  # maximum number of prices of the limit for which the dual is computed
-_PRICE_TOLERANCE = 1e-9  # relative change below which the tangents have converged
 
 
 class Costs(NamedTuple):
@@ -245,6 +243,8 @@ def limits_of(graph, costs, edge_cost, least_cost, known) -> Limits:
         only = np.zeros(n_sums)
         only[m] = 1.0
         _fill_priced(graph, costs, nothing, only, to_go)
+        if costs.limit < np.inf:
+            _try_paths(graph, costs, edge_cost, to_go, known)
         copy(to_go.least, safest[:, m])
         low[m] = np.inf
         for s in graph.starts:
@@ -253,14 +253,11 @@ def limits_of(graph, costs, edge_cost, least_cost, known) -> Limits:
     if is_beyond(costs, low):  # even a path with the smallest value of each sum
         unknown = np.full(len(graph.cell), np.inf)
         return Limits(np.inf, safest, unknown, unknown, np.zeros(n_sums), 0.0)
-    if costs.limit < np.inf:
-        _follow_tangents(graph, costs, edge_cost, nothing, costs.share, low, to_go, known)
 
     fill_to_go(graph, least_cost, to_go)
     free = to_go.least.copy()
     least = _try_paths(graph, costs, edge_cost, to_go, known)
-    sums = known.sums.copy()
-    _follow_tangents(graph, costs, edge_cost, least_cost, costs.failure, sums, to_go, known)
+    _follow_tangents(graph, costs, edge_cost, least_cost, to_go, known)
 
     # With chords as prices, a sum over edges is a lower bound on the cost (see the module
     # docstring).
@@ -284,25 +281,19 @@ def limits_of(graph, costs, edge_cost, least_cost, known) -> Limits:
 
 
 @part
-def _follow_tangents(graph, costs, edge_cost, least_cost, weights, sums, to_go, known):
-    """Try the cheapest paths for tangents to the concave sum_m weights_m (1 - exp(-r_m)).
+def _follow_tangents(graph, costs, edge_cost, least_cost, to_go, known):
+    """Try the cheapest paths for tangents to the concave cost of failure, until none is better.
 
-    The first tangent is at `sums`, the next one at the sums of the path that was found, and so on.
+    Each tangent is at the sums of the cheapest path tried last.
     """
-    price = np.zeros(len(weights))
-    for _ in range(_N_TANGENTS):
-        change = 0.0
-        largest = 0.0
-        for m in range(len(weights)):
-            before = price[m]
-            price[m] = weights[m] * math.exp(-sums[m])
-            change = max(change, abs(price[m] - before))
-            largest = max(largest, weights[m])
-        if change <= _PRICE_TOLERANCE * largest:
-            break
+    price = np.empty(len(costs.failure))
+    best = np.inf
+    while known.cost[0] < best:
+        best = known.cost[0]
+        for m in range(len(price)):
+            price[m] = costs.failure[m] * math.exp(-known.sums[m])
         _fill_priced(graph, costs, least_cost, price, to_go)
         _try_paths(graph, costs, edge_cost, to_go, known)
-        sums = known.sums
 
 
 @part
