@@ -177,6 +177,17 @@ def _neighbours(cols, pixel):
 
 
 @_part
+def _cost_of_step(paces, flat, steps, lengths, k):
+    """Return the cost of step k of `_neighbours` from a pixel, or to it, since costs are symmetric.
+
+    The cost is infinite if the step passes between two impassable pixels or cuts the corner of one.
+    """
+    if paces[flat + steps[0, k]] == np.inf or paces[flat + steps[1, k]] == np.inf:
+        return np.inf
+    return 0.5 * (paces[flat] + paces[flat + steps[2, k]]) * lengths[k]
+
+
+@_part
 def _mark(goals, is_goal):
     """Mark the goals inside the frame; return their number and the rectangle around them."""
     rows, cols = is_goal.shape
@@ -306,11 +317,8 @@ def search(pace, pixel, start, goals, slack):
 
         for k in range(8):
             to = flat + steps[2, k]
-            cost = costs[flat] + 0.5 * (paces[flat] + paces[to]) * lengths[k]
+            cost = costs[flat] + _cost_of_step(paces, flat, steps, lengths, k)
             if not cost < costs[to]:
-                continue
-            # A route must not pass between two impassable pixels or cut the corner of one.
-            if paces[flat + steps[0, k]] == np.inf or paces[flat + steps[1, k]] == np.inf:
                 continue
 
             costs[to] = cost
@@ -385,12 +393,8 @@ def _is_only_one(pace, pixel, best, way):
         before = way[k - 1, 0] * cols + way[k - 1, 1]
         for m in range(8):
             other = flat + steps[2, m]
-            if other == before or not np.isfinite(costs[other]):
-                continue
-            if paces[flat + steps[0, m]] == np.inf or paces[flat + steps[1, m]] == np.inf:
-                continue
-            cost = costs[other] + 0.5 * (paces[flat] + paces[other]) * lengths[m]
-            if cost <= costs[flat] + _TIE:
+            cost = costs[other] + _cost_of_step(paces, flat, steps, lengths, m)
+            if other != before and cost <= costs[flat] + _TIE:
                 return False
     return True
 
