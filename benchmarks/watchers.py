@@ -30,7 +30,7 @@ from world_set import World, worlds
 
 import trustbo as tb
 from trustbo.data import Station
-from trustbo.planning.problem import draws_of
+from trustbo.planning.given import draws_of
 from trustbo.planning.watchers import watchers_along
 from trustbo.workspace.moves import MOVE_NAMES, bounds_along
 

@@ -21,11 +21,12 @@ from numpy.typing import ArrayLike
 from trustbo.data import Station, require_path
 from trustbo.hazard.path_risk import Risk
 from trustbo.models.draws import Draws
+from trustbo.planning.given import mean_and_draws_of
 from trustbo.planning.objectives import capped, has_history
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
-from trustbo.planning.problem import InfeasibleError, Problem, mean_and_draws_of
+from trustbo.planning.problem import InfeasibleError, Problem
 from trustbo.planning.recursion import Recursion, states_along, trust_recursion
 from trustbo.planning.unrolled import Unrolled
 from trustbo.workspace.moves import cells_ahead

@@ -29,7 +29,7 @@ from trustbo.errors import (
 )
 from trustbo.files import FilePath, read_file, to_path, write_file
 from trustbo.planning import Plan
-from trustbo.planning.problem import mean_of
+from trustbo.planning.given import mean_of
 from trustbo.team import LEAD
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES

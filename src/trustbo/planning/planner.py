@@ -31,12 +31,13 @@ from trustbo.models.draws import Draws
 from trustbo.parallel import computing
 from trustbo.planning.drawn_paths import DrawnPaths, choose_draws, drawn_paths
 from trustbo.planning.evaluation import evaluated
+from trustbo.planning.given import draws_of, mean_and_draws_of, mean_of
 from trustbo.planning.graph import graph_of
 from trustbo.planning.maps import maps_of
 from trustbo.planning.objectives import OBJECTIVES
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.plan import Plan
-from trustbo.planning.problem import EXACT, Problem, draws_of, mean_and_draws_of, mean_of
+from trustbo.planning.problem import EXACT, Problem
 from trustbo.planning.recursion import Recursion
 from trustbo.planning.robot_trust import robot_maps, robot_trust
 from trustbo.planning.trust_map import cost_of, trust_map

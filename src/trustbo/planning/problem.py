@@ -6,23 +6,20 @@ from functools import cached_property
 from typing import Any, NamedTuple, NoReturn, cast
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 
 from trustbo.arrays import read_labelled, require_numbers
 from trustbo.data import Station, cells_of, path_text
-from trustbo.errors import TrustboError, require_kind, require_positive
+from trustbo.errors import TrustboError, require_positive
 from trustbo.fixed import Uncached
 from trustbo.hazard.path_risk import ROUNDING, Risk
-from trustbo.inference.learner import next_mission_of
-from trustbo.models.draws import Draws, NextMission
+from trustbo.models.draws import Draws
 from trustbo.planning.labels import best_labels
 from trustbo.planning.limits import LOGISTIC, LOSSES, TINY_SD, Costs
 from trustbo.planning.objectives import Objective, Weights, capped, has_history, weights_of
 from trustbo.planning.paths import AdmissiblePaths
 from trustbo.planning.recursion import Recursion, trust_recursion
 from trustbo.planning.sums import best_sums
-from trustbo.workspace import Workspace
 from trustbo.workspace.moves import (
     END,
     cells_along,
@@ -415,31 +412,3 @@ def risks_by_bound(p_fail: np.ndarray) -> np.ndarray:
         p_fail: Failure probabilities, shape (component, way, row, col, next_way).
     """
     return np.ascontiguousarray(risk_of(p_fail).reshape(len(p_fail), -1).T)
-
-
-def draws_of(params: Draws | xr.DataTree, workspace: Workspace) -> NextMission:
-    """Return the draws of a posterior for the next mission; parameters are used as they are.
-
-    The features and robots are reordered by name to match the workspace, if they have names.
-    Raises TrustboError if the type, the features or the robots are wrong.
-    """
-    if isinstance(params, xr.DataTree):
-        return next_mission_of(params, workspace)
-
-    remedy = "give a posterior from fit, or parameters"
-    draws: Draws = require_kind("posterior", params, Draws, remedy)
-    draws = draws.in_order(workspace.team.names, workspace.features)
-    return NextMission(draws, draws)
-
-
-def mean_of(params: Draws | xr.DataTree, workspace: Workspace) -> Draws:
-    """Return the mean of a posterior, with expected effects, or of draws."""
-    return draws_of(params, workspace).expected.mean()
-
-
-def mean_and_draws_of(
-    params: Draws | xr.DataTree, workspace: Workspace
-) -> tuple[Draws, Draws | None]:
-    """Return `mean_of` and the draws for bands, or None if there is only a single draw."""
-    expected, drawn = draws_of(params, workspace)
-    return expected.mean(), drawn if drawn.n_draws > 1 else None

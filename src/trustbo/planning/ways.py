@@ -17,9 +17,10 @@ from trustbo.display import Rows, Summary
 from trustbo.errors import TrustboError
 from trustbo.models.draws import Draws
 from trustbo.planning.evaluation import evaluated
+from trustbo.planning.given import mean_and_draws_of
 from trustbo.planning.plan import Plan
 from trustbo.planning.planner import Planner
-from trustbo.planning.problem import Problem, mean_and_draws_of
+from trustbo.planning.problem import Problem
 from trustbo.workspace import Workspace
 from trustbo.workspace.moves import MOVES
 
