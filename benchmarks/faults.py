@@ -67,7 +67,7 @@ FAULTS = (
     Fault("the filter ignores what a rate says of trust", "statespace/kalman.py",
           "mean = mean + gain * (m_after - m)[..., None]", "mean = mean + 0.0 * gain"),
     Fault("a mixture of proposals ignores their sizes", "inference/importance.py",
-          "density.log_density(z) + np.log(n)", "density.log_density(z)"),
+          "np.array(self._log_q) + log_share[:, None]", "np.array(self._log_q)"),
     Fault("weights that leave out a mission have the wrong sign", "inference/loo.py",
           "whole - fitted.without(j).log_evidence(theta)",
           "fitted.without(j).log_evidence(theta) - whole"),

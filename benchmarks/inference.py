@@ -46,6 +46,7 @@ import trustbo as tb
 from trustbo.inference import TrustFilter, importance, sample_prior
 from trustbo.inference.density import Density
 from trustbo.inference.diagnostics import diagnostics
+from trustbo.inference.modes import at_modes
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import CoupledTrust, PlaceEffect, PooledTrust, Priors, RobotEffect
 from trustbo.models.backend import own_settings
@@ -205,15 +206,16 @@ def long_run(data):
     """Return means and standard deviations of the hyperparameters by name, from many points."""
     model = tb.models.default_model().for_features(data[0].features)
     posterior = Density(model, model.observations(data))
+    origin = at_modes(posterior.log_density, posterior.start()[None])
     points = importance.sample(
-        posterior.log_density, posterior.start()[None], np.random.default_rng(0),
-        size=4096, enough=10_000.0, defensive=posterior.defensive,
-    )  # fmt: skip
-    values = posterior.theta(points.z)
+        posterior.log_density, origin, np.random.default_rng(0), size=4096, enough=10_000.0,
+        defensive=posterior.defensive,
+    ).points  # fmt: skip
+    values = posterior.theta(points.x)
     names = [name for name in posterior.scores.priors if name in values]
     mean = {name: points.weight @ values[name] for name in names}
     sd = {name: np.sqrt(points.weight @ (values[name] - mean[name]) ** 2) for name in names}
-    print(f"long run: {len(points.z)} points, kish {points.kish:.0f}, k-hat {points.k_hat:.2f}")
+    print(f"long run: {len(points.x)} points, kish {points.kish:.0f}, k-hat {points.k_hat:.2f}")
     return mean, sd
 
 

@@ -24,6 +24,7 @@ import trustbo as tb
 from trustbo.inference import importance
 from trustbo.inference.density import Density
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS
+from trustbo.inference.modes import at_modes
 
 SIZES = "3", "8", "15"
 OVER = "chain", "draw"
@@ -81,11 +82,12 @@ def difference(data, fits):
     model = tb.models.default_model().for_features(data[0].features)
     posterior = Density(model, model.observations(data))
     rng = np.random.default_rng(0)
+    origin = at_modes(posterior.log_density, posterior.start()[None])
     points = importance.sample(
-        posterior.log_density, posterior.start()[None], rng, size=_N_POINTS, enough=_ENOUGH,
+        posterior.log_density, origin, rng, size=_N_POINTS, enough=_ENOUGH,
         defensive=posterior.defensive,
-    )  # fmt: skip
-    values = posterior.theta(points.z)
+    ).points  # fmt: skip
+    values = posterior.theta(points.x)
 
     largest = 0.0
     for name in fits[0].data_vars:

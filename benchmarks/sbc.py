@@ -24,9 +24,9 @@ from tqdm import tqdm
 import trustbo as tb
 from trustbo.inference.classes import OfClass, by_importance
 from trustbo.inference.density import Density, JointDraws
-from trustbo.inference.importance import MAX_KHAT
 from trustbo.inference.latent import replicate
 from trustbo.inference.variables import to_variables
+from trustbo.inference.weights import MAX_KHAT
 from trustbo.models import (
     CoupledTrust,
     HierarchicalTrust,

@@ -8,8 +8,11 @@ import xarray as xr
 from scipy import special, stats
 
 import trustbo as tb
-from trustbo.inference import importance, mixtures
-from trustbo.inference.importance import Student
+from trustbo.inference import importance
+from trustbo.inference.agreed import Chart, sample_charts
+from trustbo.inference.classes import misses
+from trustbo.inference.mixture import Mixture
+from trustbo.inference.weights import smoothed
 from trustbo.models import ContactRate, PlaceEffect, PooledTrust
 
 QUIET = {"latent": False, "progress": False}
@@ -105,7 +108,7 @@ def assert_same_means(found, other, limit=LIMIT):
 def with_proposal(posterior, change):
     """The posterior with another stored proposal."""
     changed = posterior.copy(deep=True)
-    proposal = Student.from_text(posterior["sample_stats"].attrs["proposal"])
+    proposal = Mixture.from_text(posterior["sample_stats"].attrs["proposal"])
     changed["sample_stats"].attrs["proposal"] = change(proposal).text
     return changed
 
@@ -243,7 +246,7 @@ def test_nuts_of_a_function_has_the_same_posterior_from_any_start(
 def test_ratios_whose_tail_has_no_pareto_fit_have_their_own_weights(scale, seed):
     log_ratio = -scale * np.random.default_rng(seed).chisquare(5, 288)
 
-    weight, k_hat, _ = importance.smoothed(log_ratio)
+    weight, k_hat, _ = smoothed(log_ratio)
 
     np.testing.assert_allclose(weight, special.softmax(log_ratio))
     assert k_hat == np.inf
@@ -253,12 +256,13 @@ def test_points_of_a_far_first_proposal_are_marked():
     def log_density(z):
         return stats.norm(scale=0.02).logpdf(z).sum(1)
 
-    starts = np.zeros((1, 3))
-    near = Student(np.zeros(3), 0.03 * np.eye(3))
-    far = Student(np.full(3, 2.0), 0.03 * np.eye(3))
+    near = Mixture.single(np.zeros(3), 0.03 * np.eye(3))
+    far = Mixture.single(np.full(3, 2.0), 0.03 * np.eye(3))
     for first, is_far in ((near, False), (far, True)):
-        points = importance.sample(log_density, starts, np.random.default_rng(1), first=first)
-        assert points.is_far == is_far
+        found = importance.sample(
+            log_density, first, np.random.default_rng(1), is_known=True, defensive=lambda own: own
+        )
+        assert found.is_far == is_far
 
 
 def test_points_at_one_mode_miss_a_higher_one():
@@ -267,14 +271,13 @@ def test_points_at_one_mode_miss_a_higher_one():
         high = stats.multivariate_normal([3.0, 0.0], 0.01).logpdf(z) + 20.0
         return np.atleast_1d(np.logaddexp(low, high))
 
-    near_low = Student(np.array([-3.0, 0.0]), 0.1 * np.eye(2))
-    points = importance.sample(
-        log_density, np.zeros((1, 2)), np.random.default_rng(1),
-        first=near_low, defensive=lambda proposal: proposal,
-    )  # fmt: skip
+    near_low = Mixture.single(np.array([-3.0, 0.0]), 0.1 * np.eye(2))
+    found = importance.sample(
+        log_density, near_low, np.random.default_rng(1), is_known=True, defensive=lambda own: own
+    )
 
-    assert points.misses(log_density, np.array([3.0, 0.0]))
-    assert not points.misses(log_density, np.array([-3.0, 0.0]))
+    assert misses(found, log_density, np.array([3.0, 0.0]))
+    assert not misses(found, log_density, np.array([-3.0, 0.0]))
 
 
 def test_a_mixture_without_a_point_of_positive_density_is_complained_of():
@@ -282,9 +285,9 @@ def test_a_mixture_without_a_point_of_positive_density_is_complained_of():
         return np.where((np.abs(x - 60.0) < 0.1).all(1), 0.0, -np.inf)
 
     start = np.random.default_rng(0).standard_normal((500, 2))
-    chart = mixtures.Chart(log_density, [start], lambda x: x, lambda x: x)
+    chart = Chart(log_density, [start], lambda x: x, lambda x: x)
 
-    found = mixtures.sample([chart], seed=1)
+    found = sample_charts([chart], seed=1)
 
-    assert found.complaints != []
+    assert found.complaints
     assert np.isfinite(found.weight).all()

@@ -36,6 +36,9 @@ from trustbo.hazard.prior import FLOOR, LIMIT_NAMES, BoundPrior, Hazard
 from trustbo.hazard.risk import add_lost
 from trustbo.hazard.trials import LostMission, Trials
 from trustbo.inference import importance
+from trustbo.inference.mixture import Mixture
+from trustbo.inference.modes import at_modes
+from trustbo.inference.weights import MAX_KHAT
 from trustbo.parallel import computing
 from trustbo.stacking import list_of_missions
 from trustbo.workspace import Workspace
@@ -44,6 +47,8 @@ from trustbo.workspace.moves import next_names, way_names
 
 _ROUND = 1024
 """Number of points of importance sampling per round."""
+_PRIOR_SCALE = 1.2
+"""Scale of the defensive proposal; that of the prior is 1."""
 _ENOUGH = 500.0
 """Effective number of points at which sampling stops."""
 _MORE = 8
@@ -149,8 +154,8 @@ def fit_hazard(
     group.attrs |= {f"prior_{name}": list(value) for name, value in asdict(hazard).items()}
     group.attrs["seconds"] = time.perf_counter() - started
 
-    if not points.k_hat <= importance.MAX_KHAT:
-        reason = f"the hazard posterior has k-hat {points.k_hat:.2f} > {importance.MAX_KHAT:g}."
+    if not points.k_hat <= MAX_KHAT:
+        reason = f"the hazard posterior has k-hat {points.k_hat:.2f} > {MAX_KHAT:g}."
         raise PosteriorError(reason, group, "Use more informative priors in Hazard(...).")
 
     return group
@@ -202,23 +207,32 @@ def sample(
 
         return total - _log_rising(strength, counts) @ times
 
-    starts = _starts(prior)
+    origin = at_modes(log_density, _starts(prior))
     for more in (1, _MORE):
         size = more * _ROUND
         enough = more * _ENOUGH
-        points = importance.sample(log_density, starts, rng, size=size, enough=enough)
-        places = np.zeros((len(points.z), len(paths)), int)
+        found = importance.sample(
+            log_density, origin, rng, size=size, enough=enough, defensive=_wider_prior
+        )
+        points = found.points
+        places = np.zeros((len(points.x), len(paths)), int)
 
         if paths:
-            alpha, beta = prior.betas(points.z)
+            alpha, beta = prior.betas(points.x)
             # Sequential imputation (Kong, Liu and Wong 1994) corrects for dependent failures.
             places, log_fail = impute(alpha + failed, beta + n - failed, paths, rng)
             ratio = points.log_ratio + log_fail - log_any_fails(alpha, beta)
-            points = importance.Points.from_log_weights(points.z, points.log_p, ratio, points.near)
+            points = importance.Points.weighted(points.x, points.log_p, ratio)
 
-        if points.k_hat <= importance.MAX_KHAT:
+        if points.k_hat <= MAX_KHAT:
             break
     return points, places
+
+
+def _wider_prior(current: Mixture) -> Mixture:
+    """Return a proposal for regions that the current one may miss."""
+    d = current.center.shape[1]
+    return Mixture.single(np.zeros(d), _PRIOR_SCALE * np.eye(d))
 
 
 def _starts(prior: BoundPrior) -> np.ndarray:
@@ -330,7 +344,7 @@ def _to_dataset(
     """
     rng = np.random.default_rng([seed, 2])
     chosen = rng.permutation(points.resample(_N_DRAWS, rng))
-    weights, limit, strength = prior.values(points.z[chosen])
+    weights, limit, strength = prior.values(points.x[chosen])
 
     degrees = {"units": "degrees"}
     of_limit = {

@@ -15,16 +15,7 @@ from trustbo.display import slow_bar
 from trustbo.inference import ep
 from trustbo.inference.density import Coefficients, Density, JointDraws, at
 from trustbo.inference.engine import inputs
-from trustbo.inference.importance import (
-    ENOUGH,
-    MAX_KHAT,
-    ROUNDS,
-    Points,
-    Student,
-    climb,
-    climb_on,
-    sample,
-)
+from trustbo.inference.importance import ENOUGH, ROUNDS, SIZE, Points, Sampled, sample
 from trustbo.inference.latent import (
     N_PRIOR,
     N_TRAJECTORIES,
@@ -34,11 +25,14 @@ from trustbo.inference.latent import (
     draw_exactly,
     root_of,
 )
+from trustbo.inference.mixture import Mixture
+from trustbo.inference.modes import LogDensity, at_modes, climb, climb_on
 from trustbo.inference.nuts import sample_by_nuts
 from trustbo.inference.options import Options
 from trustbo.inference.params import parameters_of, stored_draws
 from trustbo.inference.tree import Fitted, by_chain, default_draws
 from trustbo.inference.variables import prior_parameters, to_variables, with_prior_effects
+from trustbo.inference.weights import MAX_KHAT
 from trustbo.models.model import TrustModel
 from trustbo.models.record import model_to_record
 from trustbo.models.scores import log_density
@@ -50,8 +44,6 @@ SAMPLERS = ("importance", "nuts")
 """Names of the samplers of model classes, the default first."""
 _NEGLIGIBLE = 0.01
 """Weight of a point, relative to the mean weight, below which EP is not corrected there."""
-_SIZE = 256
-"""Points per round of the importance sampler."""
 _LAST_SIZE = 1024
 """Points per round of the last attempt, if rates are Gaussian."""
 _LAST_ROUNDS = 12
@@ -59,6 +51,8 @@ _LAST_ROUNDS = 12
 _CORRECTIONS = 4
 """Number of draws of the coefficients by which EP is corrected at each point in the last attempt,
 if rates are not Gaussian."""
+_MISSED = np.log(1000.0)
+"""Log ratio of the posterior to the points' proposal above which points miss a mode."""
 _MANY_SCORES = 13
 """Smallest number of scores for which a round has four times as many points."""
 _CHUNK = 32
@@ -141,7 +135,7 @@ def fit_class(
 
 
 def by_importance(
-    density: Density, n: int, seed: int, first: Student | None = None
+    density: Density, n: int, seed: int, first: Mixture | None = None
 ) -> tuple[JointDraws, dict[str, np.ndarray], dict[str, Any]]:
     """Take n draws by importance sampling; return the draws, statistics (draw,) and a summary.
 
@@ -151,10 +145,10 @@ def by_importance(
     Gaussian, EP is corrected at each point instead of drawing larger rounds.
     """
     rng = np.random.default_rng(seed)
-    last_size = _LAST_SIZE if density.is_gaussian else _SIZE
-    attempts = [(_SIZE, None), (last_size, None)]
+    last_size = _LAST_SIZE if density.is_gaussian else SIZE
+    attempts = [(SIZE, None), (last_size, None)]
     if first and _is_possible(density, first):
-        attempts = [(_SIZE, first), *attempts]
+        attempts = [(SIZE, first), *attempts]
     while True:
         size, proposal = attempts.pop(0)
         if density.n_scores >= _MANY_SCORES:
@@ -170,7 +164,7 @@ def by_importance(
             return drawn, {"lp": log_p}, summary
 
 
-def _is_possible(density: Density, first: Student) -> bool:
+def _is_possible(density: Density, first: Mixture) -> bool:
     """Return whether a first proposal is finite and has a positive density at its center.
 
     Unless rates are Gaussian, EP is run there; if the proposal is not possible, EP forgets it.
@@ -179,7 +173,7 @@ def _is_possible(density: Density, first: Student) -> bool:
         if not all(np.isfinite(array**2).all() for array in first):
             return False
 
-        center = first.center[None]
+        center = first.mean[None]
         density.run_ep(density.theta(center))
     if np.isfinite(density.log_density(center)[0]):
         return True
@@ -188,7 +182,7 @@ def _is_possible(density: Density, first: Student) -> bool:
     return False
 
 
-def _is_elsewhere(density: Density, points: Points) -> bool:
+def _is_elsewhere(density: Density, found: Sampled) -> bool:
     """Return whether points whose first proposal was far away do not represent the posterior.
 
     They may be on the way to it, with too few effective points when the rounds end, or at a lower
@@ -198,13 +192,19 @@ def _is_elsewhere(density: Density, points: Points) -> bool:
     if not density.is_gaussian:
         density.reset_ep()
         return True
+    points = found.points
     if points.k_hat > MAX_KHAT:
         return False  # the search follows in any case
     if points.kish < ENOUGH:
         return True
 
-    mode = climb(density.log_density, density.start())
-    return points.misses(density.log_density, mode)
+    return misses(found, density.log_density, climb(density.log_density, density.start()))
+
+
+def misses(found: Sampled, log_density: LogDensity, mode: np.ndarray) -> bool:
+    """Return whether the density at a mode (score,) is far above that of the points."""
+    log_p = log_density(mode[None]) - found.points.log_evidence
+    return bool(log_p[0] - found.proposal.log_density(mode[None])[0] > _MISSED)
 
 
 @np.errstate(all="ignore")  # scores of points that are far away overflow
@@ -213,7 +213,7 @@ def _draws(
     n: int,
     size: int,
     rng: np.random.Generator,
-    first: Student | None,
+    first: Mixture | None,
     is_last: bool,
 ) -> tuple[JointDraws, np.ndarray, dict[str, Any]] | None:
     """Take n draws, beginning with the proposal `first` or with a search for the mode.
@@ -228,8 +228,9 @@ def _draws(
         start = density.start()
         if is_last:
             start = climb_on(density.log_density, start)
+        origin = at_modes(density.log_density, start[None])
     else:
-        start = first.center
+        origin = first
 
     at_once = is_last and not density.is_gaussian
     visited: list[Coefficients] = []
@@ -248,16 +249,16 @@ def _draws(
         corrected.append(c)
         return log_p
 
-    points = sample(
-        density.log_density, start[None], rng,
-        size=size, most=_LAST_ROUNDS if is_last else ROUNDS,
-        defensive=density.defensive, first=first, visit=visit,
+    found = sample(
+        density.log_density, origin, rng,
+        is_known=first is not None, size=size, most=_LAST_ROUNDS if is_last else ROUNDS,
+        defensive=density.defensive, visit=visit,
     )  # fmt: skip
-    if first is not None and points.is_far and _is_elsewhere(density, points):
+    if first is not None and found.is_far and _is_elsewhere(density, found):
         return None
 
+    points = found.points
     coefficients = Coefficients.joined(visited)
-    proposal = points.proposal.text
 
     if density.is_gaussian:
         chosen = points.resample(n, rng)
@@ -271,20 +272,20 @@ def _draws(
         c = c[chosen]
 
     summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
-    drawn = JointDraws(density.theta(points.z[chosen]), c)
-    return drawn, points.log_p[chosen], summary | {"proposal": proposal}
+    drawn = JointDraws(density.theta(points.x[chosen]), c)
+    return drawn, points.log_p[chosen], summary | {"proposal": found.proposal.text}
 
 
 def _corrected(
     density: Density, points: Points, coefficients: Coefficients, rng: np.random.Generator
 ) -> tuple[Points, np.ndarray]:
     """Draw coefficients (point, column) at all points, and correct the weights for errors of EP."""
-    some = np.flatnonzero(points.weight * len(points.z) > _NEGLIGIBLE)
-    log_p, c = _correction(density, points.z, coefficients, some, rng)
+    some = np.flatnonzero(points.weight * len(points.x) > _NEGLIGIBLE)
+    log_p, c = _correction(density, points.x, coefficients, some, rng)
 
     log_ratio = points.log_ratio.copy()
     log_ratio[some] += log_p - points.log_p[some]
-    return Points.from_log_weights(points.z, points.log_p, log_ratio, points.near), c
+    return Points.weighted(points.x, points.log_p, log_ratio), c
 
 
 def _correction(
@@ -313,13 +314,13 @@ def _correction(
     return logsumexp(log_p, axis=0) - np.log(n), c
 
 
-def _first_proposal(start: xr.DataTree | None, record: str) -> Student | None:
+def _first_proposal(start: xr.DataTree | None, record: str) -> Mixture | None:
     """Return the proposal of a posterior of a model with this record, or None."""
     if start is None or start.attrs["model_record"] != record:
         return None
 
     text = start["sample_stats"].attrs.get("proposal")
-    return None if text is None else Student.from_text(text)
+    return None if text is None else Mixture.from_text(text)
 
 
 def _described(model: TrustModel) -> dict[str, Any]:

@@ -9,7 +9,8 @@ from scipy import special
 from trustbo.inference import ep
 from trustbo.inference.columns import Columns
 from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, evidence, expected
-from trustbo.inference.importance import Student, climb
+from trustbo.inference.mixture import Mixture
+from trustbo.inference.modes import climb
 from trustbo.models.effects.effect import Theta
 from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
@@ -296,19 +297,19 @@ class Density:
         self.run_ep(self.theta(starts[1:2]))  # the sites of the second start suit all four
         return starts[self.log_density(starts).argmax()]
 
-    def defensive(self, proposal: Student) -> Student:
+    def defensive(self, proposal: Mixture) -> Mixture:
         """Widen a proposal for beta0, noises and sizes; keep other scores near the prior."""
         core = self.scores.core
         others = np.setdiff1d(np.arange(self.n_scores), core)
 
-        center = proposal.center.copy()
+        center = proposal.mean
         center[others] = 0.0
 
-        cov = _WIDER * proposal.scale @ proposal.scale.T
+        cov = _WIDER * proposal.total
         cov[others] = 0.0
         cov[:, others] = 0.0
         cov[others, others] = _PRIOR_VARIANCE
-        return Student(center, np.linalg.cholesky(cov))
+        return Mixture.single(center, np.linalg.cholesky(cov))
 
     def log_joint(
         self,

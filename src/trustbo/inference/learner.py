@@ -6,8 +6,8 @@ and planners use without distinguishing them. How a model is sampled is decided 
 1. `as_learner` makes a `Learner` for a class, or a `FunctionLearner` for a function.
 2. Classes: `classes.fit_class` uses importance sampling (`importance.py`), or NUTS (`nuts.py`) on
    request. With Gaussian rates, coefficients are integrated out exactly, otherwise by EP (`ep.py`).
-3. Functions: `functions.sampling` uses importance sampling (`mixtures.py`). If its checks fail, it
-   uses NUTS, unless the function has effects.
+3. Functions: `functions.sampling` uses the same importance sampling in two runs that must agree
+   (`agreed.py`). If they do not, it uses NUTS, unless the function has effects.
 """
 
 import json

@@ -27,6 +27,7 @@ from trustbo.errors import TrustboError
 from trustbo.inference import importance
 from trustbo.inference.density import Density, JointDraws
 from trustbo.inference.diagnostics import FIELDS, complaints_of, statistics_of
+from trustbo.inference.modes import at_modes
 from trustbo.models.backend import own_settings
 from trustbo.streams import stream
 
@@ -293,10 +294,9 @@ def sample_by_nuts(
         checks.
     """
     rng = stream(seed, "nuts")
-    points = importance.sample(
-        density.log_density, density.start()[None], rng, defensive=density.defensive
-    )
-    z = points.z[points.resample(_POINTS, rng)]
+    origin = at_modes(density.log_density, density.start()[None])
+    points = importance.sample(density.log_density, origin, rng, defensive=density.defensive).points
+    z = points.x[points.resample(_POINTS, rng)]
 
     tunings = [_OF_SCORES, _SHORT_STEPS] if density.is_gaussian else [_OF_PROGRAM]
     if warmup is not None:

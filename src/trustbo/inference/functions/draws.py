@@ -16,8 +16,7 @@ from trustbo.inference.functions.data import (
     observations_of,
     require_same_order,
 )
-from trustbo.inference.functions.function import FunctionModel, in_batches
-from trustbo.inference.mixtures import BATCH
+from trustbo.inference.functions.function import BATCH, FunctionModel, in_batches
 from trustbo.models.backend import own_settings
 from trustbo.models.draws import PLACES, Draws, Order
 from trustbo.models.params import assemble_params

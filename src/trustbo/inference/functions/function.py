@@ -36,7 +36,6 @@ from trustbo.inference.functions.sites import (
     plates_of_rates,
     site_of,
 )
-from trustbo.inference.mixtures import BATCH
 from trustbo.models.backend import own_settings
 from trustbo.models.contact_rate import ContactRate
 from trustbo.models.effects.effect import Effect
@@ -49,6 +48,8 @@ KIND = "function"
 """Value of the entry `class` in the record of a model that is a function."""
 _ALIKE = 0.85
 """Similarity (`difflib`) of a parameter to the name of an input from which a warning is issued."""
+BATCH = 128
+"""Number of draws for which functions are compiled; a larger one is no faster."""
 _MOST_TRACED = 16
 """Number of shapes of data whose traces are kept."""
 

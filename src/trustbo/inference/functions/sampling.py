@@ -11,7 +11,7 @@ from trustbo.arrays import evenly_spaced
 from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, warn
-from trustbo.inference import mixtures
+from trustbo.inference.agreed import Chart, sample_charts
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, statistics_of
 from trustbo.inference.functions.coordinates import Coordinates
 from trustbo.inference.functions.data import RATES, Data
@@ -19,6 +19,7 @@ from trustbo.inference.functions.effects import AddedEffects
 from trustbo.inference.functions.explain import reason_of
 from trustbo.inference.functions.function import FunctionModel, Outer, in_batches
 from trustbo.inference.functions.sites import Site, safe
+from trustbo.inference.importance import Points
 from trustbo.inference.nuts import Chains, Samples, Start, Tuning
 from trustbo.inference.options import Options
 from trustbo.inference.params import joined_draws
@@ -53,6 +54,10 @@ _NAMES_OF_FIELDS = {
 """Names of the fields of a form as arguments of `ContactRate`."""
 _CHECKED = 100
 """Largest number of measured bounds whose drift is checked."""
+_SPREAD = 1.4826
+"""Standard deviation of a normal distribution per median distance from its median."""
+_LEAST_SPREAD = 1e-9
+"""Smallest spread of a coordinate."""
 _N_STARTS = 1000
 """Largest number of draws of a previous posterior to which the first proposal is fitted."""
 
@@ -213,8 +218,10 @@ def sampled(
     if sampler != NUTS or known is None:  # also for the starts of NUTS
         starts = [prior] if known is None else [known, prior]
         with slow_bar("fit", " points", options.progress) as bar:
-            charts = [_chart(one, target, starts, bar) for one in targets]
-            found = mixtures.sample(charts, seed, target.coordinates.names)
+            scaled = [Scaled(one, prior, bar) for one in targets]
+            charts = [_chart(one, scaled[0], starts) for one in scaled]
+            found = sample_charts(charts, seed, target.coordinates.names)
+            found = found._replace(x=scaled[0].unscaled(found.x))
         has_effects = target.effects is not None  # these have no gradient
         if sampler == IMPORTANCE or has_effects or (sampler == AUTO and not found.complaints):
             return _resampled(target, found, options.chains * draws, seed)
@@ -234,21 +241,45 @@ def sampled(
     return drawn
 
 
-def _chart(
-    target: Target, first: Target, starts: Sequence[Mapping[str, np.ndarray]], bar: Any
-) -> mixtures.Chart:
-    """Return the coordinates of a target, which counts points in a progress bar."""
+class Scaled:
+    """A target in coordinates in which the prior has about the mean 0 and the scale 1."""
 
-    def log_density(x: np.ndarray) -> np.ndarray:
-        bar.update(len(x))
-        return target.log_density(x)
+    def __init__(self, target: Target, prior: Mapping[str, np.ndarray], bar: Any) -> None:
+        """Take middle and spread from draws of the prior; `bar` counts points."""
+        x = target.finite_points(prior)
+        self.target = target
+        self.bar = bar
+        self.middle = np.median(x, axis=0)
+        self.spread = _SPREAD * np.median(np.abs(x - self.middle), axis=0) + _LEAST_SPREAD
+        self.log_volume = np.log(self.spread).sum()
 
-    points = [target.finite_points(values) for values in starts]
-    return mixtures.Chart(
-        log_density,
-        [x for x in points if len(x)],
-        to_first=lambda x: x if target is first else first.points(target.values(x)),
-        from_first=lambda x: x.copy() if target is first else target.points(first.values(x)),
+    def log_density(self, z: np.ndarray) -> np.ndarray:
+        """Compute the log density (point,) of points (point, coordinate)."""
+        self.bar.update(len(z))
+        return self.target.log_density(self.unscaled(z)) + self.log_volume
+
+    def unscaled(self, z: np.ndarray) -> np.ndarray:
+        """Convert points to the coordinates of the target."""
+        return self.middle + self.spread * z
+
+    def points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Convert values (draw, ...) of the variables to points (draw, coordinate)."""
+        return (self.target.points(values) - self.middle) / self.spread
+
+    def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
+        """Convert points (draw, coordinate) to values (draw, ...) of the variables."""
+        return self.target.values(self.unscaled(z))
+
+
+def _chart(own: Scaled, first: Scaled, starts: Sequence[Mapping[str, np.ndarray]]) -> Chart:
+    """Return the coordinates of a target."""
+    points = [own.points(values) for values in starts]
+    finite = [x[np.isfinite(x).all(1)] for x in points]
+    return Chart(
+        own.log_density,
+        [x for x in finite if len(x)],
+        to_first=lambda x: x if own is first else first.points(own.values(x)),
+        from_first=lambda x: x.copy() if own is first else own.points(first.values(x)),
     )
 
 
@@ -294,11 +325,11 @@ def _values_of(
 
 def _is_possible(target: Target, values: Mapping[str, np.ndarray]) -> bool:
     """Return whether any draw of the variables has a positive density."""
-    x = target.finite_points(values)[: mixtures.BATCH]
+    x = target.finite_points(values)
     return len(x) > 0 and bool(np.isfinite(target.log_density(x)).any())
 
 
-def _resampled(target: Target, found: mixtures.Sample, n: int, seed: int) -> Drawn:
+def _resampled(target: Target, found: Points, n: int, seed: int) -> Drawn:
     """Return n equally weighted draws of weighted points."""
     chosen = found.resample(n, stream(seed, "draws of points"))
     x = found.x[chosen]
@@ -310,7 +341,7 @@ def _resampled(target: Target, found: mixtures.Sample, n: int, seed: int) -> Dra
     }
     lp = found.log_p[chosen][None]
     effects = target.draw_effects(x, stream(seed, "draws of effects"))
-    return Drawn(target.values(x), {"lp": lp}, attrs, found.complaints, effects)
+    return Drawn(target.values(x), {"lp": lp}, attrs, list(found.complaints), effects)
 
 
 class Verdict(NamedTuple):

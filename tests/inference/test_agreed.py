@@ -9,8 +9,10 @@ import pytest
 from scipy import stats
 
 import trustbo as tb
+from trustbo.inference.agreed import Chart, sample_charts
 from trustbo.inference.functions.coordinates import Coordinates
-from trustbo.inference.mixtures import Chart, Mixture, Visited, lost_modes, sample
+from trustbo.inference.mixture import Mixture
+from trustbo.inference.search import Visited, lost_modes
 from trustbo.models import ContactRate
 from trustbo.models.backend import own_settings
 
@@ -32,10 +34,10 @@ def moments(found):
 def test_a_normal_density_has_its_moments_and_its_evidence():
     cov = np.array([[0.04, 0.03], [0.03, 0.09]])
     law = stats.multivariate_normal([1.0, -2.0], cov)
-    found = sample(only(lambda x: law.logpdf(x) + 5.0), seed=1)
+    found = sample_charts(only(lambda x: np.atleast_1d(law.logpdf(x) + 5.0)), seed=1)
     mean, sd = moments(found)
     error = np.sqrt(np.diag(cov) / found.kish)
-    assert found.complaints == []
+    assert found.complaints == ()
     assert found.kish > 1000.0
     assert (np.abs(mean - [1.0, -2.0]) < 5.0 * error).all()
     np.testing.assert_allclose(sd, np.sqrt(np.diag(cov)), rtol=0.1)
@@ -48,31 +50,35 @@ def two_modes(x):
         np.log(share) + stats.multivariate_normal(center, 0.01).logpdf(x)
         for share, center in ((0.8, [2.0, 0.0]), (0.2, [-2.0, 1.0]))
     ]
-    return np.logaddexp(*parts)
+    return np.atleast_1d(np.logaddexp(*parts))
 
 
 def test_both_modes_have_their_shares():
-    found = sample(only(two_modes), seed=1)
-    assert found.complaints == []
+    found = sample_charts(only(two_modes), seed=1)
+    assert found.complaints == ()
     assert found.weight[found.x[:, 0] < 0.0].sum() == pytest.approx(0.2, abs=0.03)
     assert found.log_evidence == pytest.approx(0.0, abs=0.1)
 
 
 def test_runs_that_find_different_modes_do_not_agree(monkeypatch):
     """Each run is led to another mode, where it alone would be content."""
-    led = iter(([2.0, 0.0], [-2.0, 1.0]) * 2)
+    led = iter(([2.0, 0.0], [-2.0, 1.0]) * 3)
+
+    def at_modes(log_density, starts):
+        return Mixture.single(np.array(next(led)), 0.1 * np.eye(2))
 
     def search(log_density, starts, wanted, rng):
-        center = np.array(next(led))
-        return Mixture(np.ones(1), center[None], 0.1 * np.eye(2)[None]), 0.0
+        return at_modes(log_density, starts), 0.0
 
-    monkeypatch.setattr("trustbo.inference.mixtures.search", search)
-    found = sample(only(two_modes), seed=1)
+    monkeypatch.setattr("trustbo.inference.agreed.at_modes", at_modes)
+    monkeypatch.setattr("trustbo.inference.agreed.search", search)
+    monkeypatch.setattr("trustbo.inference.agreed._PRIOR_SCALE", 0.1)  # it would find the other
+    found = sample_charts(only(two_modes), seed=1)
     assert any("standard deviations" in one for one in found.complaints)
     assert any("evidences" in one for one in found.complaints)
 
 
-FIRST_MODE = Mixture(np.ones(1), np.array([[2.0, 0.0]]), 0.1 * np.eye(2)[None])
+FIRST_MODE = Mixture.single(np.array([2.0, 0.0]), 0.1 * np.eye(2))
 
 
 def test_visited_points_show_a_mode_that_the_search_has_lost():
@@ -122,21 +128,21 @@ def test_points_of_two_charts_are_those_of_one_density():
     centred = Chart(
         lambda x: funnel(x) + 0.0, [start], to_first=as_deviations, from_first=of_deviations
     )
-    found = sample([deviations, centred], seed=1)
+    found = sample_charts([deviations, centred], seed=1)
     mean, sd = moments(found)
-    assert found.complaints == []
+    assert found.complaints == ()
     assert np.abs(mean).max() < 0.15
     np.testing.assert_allclose(sd, [1.5, *[1.0] * 8], rtol=0.1)
     assert found.log_evidence == pytest.approx(0.0, abs=0.1)
 
 
 def test_a_density_without_an_integral_is_complained_of():
-    found = sample(only(lambda x: -2.0 * np.log(np.abs(x)).sum(1)), seed=1)
+    found = sample_charts(only(lambda x: -2.0 * np.log(np.abs(x)).sum(1)), seed=1)
     assert found.complaints
 
 
 def test_the_same_seed_gives_the_same_points():
-    one, same, other = (sample(only(two_modes), seed=seed) for seed in (1, 1, 2))
+    one, same, other = (sample_charts(only(two_modes), seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.x, same.x)
     np.testing.assert_array_equal(one.weight, same.weight)
     assert one.x.shape != other.x.shape or not np.array_equal(one.x, other.x)
