@@ -1,5 +1,6 @@
 """Effects of places and robots in NumPyro functions."""
 
+import arviz as az
 import jax.numpy as jnp
 import numpy as np
 import numpyro
@@ -157,7 +158,7 @@ def test_the_density_is_that_of_one_large_normal(function, missions):
     keys = keys_of(2, 0)
     prior = model.over_draws("prior", 1, target.data)(keys)
     x = target.points(prior)
-    found = target.log_density(x) - target._given(x)[0]
+    found = target.log_density(x) - target.outer(x).log_p
 
     n_missions, n_bounds, n_robots = target.effects.observations.contact_rate.shape
     resolution = target.effects.observations.resolution
@@ -241,13 +242,20 @@ def test_a_campaign_learns_the_effects_and_resumes(campaign, tmp_path):
     assert set(maps.data_vars) >= {"trust_mean", "trust_sd"}
 
 
-def test_nuts_is_refused(workspace, missions):
-    with pytest.raises(
-        TrustboError, match='importance sampling integrates out; use sampler="auto"'
-    ):
-        tb.fit(missions, linear, sampler="nuts", progress=False)
-    with pytest.raises(TrustboError, match='use sampler="auto"'):
-        tb.Campaign(workspace, (4, 0), (0, 4), model=linear, sampler="nuts", progress=False)
+def test_nuts_has_the_same_posterior(missions):
+    """Means differ by at most 4 standard errors of their difference."""
+    quiet = {"latent": False, "progress": False}
+    ours = tb.fit(missions, linear, sampler="importance", **quiet)
+    nuts = tb.fit(missions, linear, sampler="nuts", draws=300, check=False, **quiet)
+
+    over = ("chain", "draw")
+    for group in ("posterior", "places"):
+        one, other = ours[group].to_dataset(), nuts[group].to_dataset()
+        error = np.sqrt(1.0 / ours.attrs["kish"] + 1.0 / az.ess(other))
+        gap = abs(one.mean(over) - other.mean(over)) / other.std(over)
+        for name in error.data_vars:
+            assert float((gap[name] / error[name]).max()) < 4.5, name
+    assert nuts.attrs["divergences"] == 0
 
 
 @pytest.mark.parametrize(

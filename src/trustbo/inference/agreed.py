@@ -96,10 +96,10 @@ def sample_charts(charts: Sequence[Chart], seed: int, names: Sequence[str] | Non
     ]
     if len(charts) == 1:
         ways.insert(0, _from_modes)
-    for number, begin in enumerate(ways):
-        found = _attempt(charts, begin, [seed, number], names)
-        if not found.complaints:
-            break
+    found = _attempt(charts, ways[0], [seed, 0], names)
+    for number, begin in enumerate(ways[1:], 1):
+        if found.complaints:
+            found = _attempt(charts, begin, [seed, number], names)
     return found
 
 

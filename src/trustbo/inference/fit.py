@@ -68,8 +68,8 @@ def fit(
             compilation, and integrates out all variables except hyperparameters. `"nuts"` uses
             NumPyro's NUTS, which also samples trust unless rates are Gaussian. The default is
             `"importance"` for model classes. A function is sampled by `"importance"` in two runs
-            that must agree, by `"nuts"`, or by `"auto"`, the default: importance sampling and, where its
-            checks fail, NUTS.
+            that must agree, by `"nuts"`, or by `"auto"`, the default: importance sampling and,
+            where its checks fail and the function has no effects, NUTS.
         workspace: Workspace of the missions. If given, features and robots are reordered to match
             the workspace, missing awareness such as line of sight is filled in (see
             `Workspace.fill`), and place effects cover the whole grid. Missions over cells without

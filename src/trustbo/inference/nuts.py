@@ -128,11 +128,9 @@ Compiled = Callable[[tuple[Any, ...], Callable[..., Any], int], Callable[..., An
 the axis (chain,), and the last one is the data; the compiled function takes the first ones."""
 
 
-def compiled_without_data(
-    key: tuple[Any, ...], compute: Callable[..., Any], n_chain_axes: int
-) -> Callable[..., Any]:
-    """Compile a function whose data are None; see `Compiled`."""
-    mapped = jax.jit(jax.vmap(lambda *of_chain: compute(*of_chain, None)))
+def compiled_with(compute: Callable[..., Any], n_chain_axes: int, data: Any) -> Callable[..., Any]:
+    """Compile a function for these data only; see `Compiled`."""
+    mapped = jax.jit(jax.vmap(lambda *of_chain: compute(*of_chain, data)))
 
     def call(*of_chains: Any) -> Any:
         with own_settings():
@@ -302,7 +300,7 @@ def sample_by_nuts(
     if warmup is not None:
         tunings = [tuning._replace(warmup=warmup) for tuning in tunings]
     if density.is_gaussian:
-        log_density = _in_jax(density)
+        log_density = in_jax(lambda z, _: z, density.log_density)
         start = Start.near(z, chains, seed)
         constrain = density.scores.values
     else:
@@ -312,8 +310,9 @@ def sample_by_nuts(
     while True:
         tuning = tunings.pop(0)
         sampler = Chains(
-            log_density, compiled_without_data, tuning, who=who, seed=seed, progress=progress
-        )
+            log_density, lambda _, compute, n: compiled_with(compute, n, None), tuning,
+            who=who, seed=seed, progress=progress,
+        )  # fmt: skip
         samples = sampler.run(start, draws)
         found = constrain(samples.points)
         values = {name: found[name] for name in density.scores.priors}
@@ -328,50 +327,54 @@ def sample_by_nuts(
     return JointDraws(theta, c), statistics, summary, complaints
 
 
-def log_density_and_slopes(density: Density, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute `Density.log_density` (point,) and its derivatives (point, score) at scores z.
+def in_jax(
+    prepare: Callable[[Any, Any], Any], log_density: Callable[[Any], np.ndarray]
+) -> LogDensity:
+    """Return a log density in JAX, up to a constant, part of which NumPy computes.
 
-    The derivatives are differences; NUTS samples the exact density for any approximation of them.
-    Where the density is 0, or its derivatives are not finite, both are those of density 0.
-    """
-    n, n_scores = z.shape
-    steps = _STEP * np.vstack([np.zeros(n_scores), np.eye(n_scores)])
-    near = (z[:, None] + steps).reshape(-1, n_scores)
-    values = density.log_density(near).reshape(n, -1)
-    with np.errstate(invalid="ignore"):  # differences of infinite values
-        slopes = (values[:, 1:] - values[:, :1]) / _STEP
-
-    is_finite = np.isfinite(values).all(1)
-    log_p = np.where(is_finite, values[:, 0], -np.inf)
-    return log_p, np.where(is_finite[:, None], slopes, 0.0)
-
-
-def _in_jax(density: Density) -> LogDensity:
-    """Return the log density of scores (score,) and no data in JAX, with its gradient.
+    Its gradient is that of differences; NUTS samples the exact density for any approximation of it.
+    Where the density is 0, or its gradient is not finite, both are those of density 0.
 
     Numbers are passed as pairs of integers: callbacks run in threads of JAX without the setting of
     `own_settings`, in which JAX would round them to single precision.
+
+    Args:
+        prepare: Computes arrays for coordinates (coordinate,) and data, in JAX.
+        log_density: Computes the log density (point,) for the same arrays with the axis (point,),
+            in NumPy; JAX must not be used here, where it may wait for itself.
     """
 
-    def on_bits(bits: Any) -> np.ndarray:
-        z = np.asarray(bits).view(np.float64)[..., 0]  # (..., score); `jax.vmap` adds axes
-        log_p, slopes = log_density_and_slopes(density, z.reshape(-1, z.shape[-1]))
-        found = np.concatenate([log_p[:, None], slopes], axis=1)
-        return found.reshape(*z.shape[:-1], -1, 1).view(np.uint32)
+    def of_data(x: Any, data: Any) -> Any:
+        def found(x: Any) -> tuple[Any, Any]:
+            steps = _STEP * jnp.vstack([jnp.zeros(len(x)), jnp.eye(len(x))])
+            arrays = jax.vmap(lambda x: prepare(x, data))(x + steps)
+            n_axes = [jnp.ndim(array) for array in jax.tree.leaves(arrays)]
 
-    def found(z: Any) -> tuple[Any, Any]:
-        bits = jax.pure_callback(
-            on_bits,
-            jax.ShapeDtypeStruct((len(z) + 1, 2), np.uint32),
-            lax.bitcast_convert_type(z, np.uint32),
-            vmap_method="broadcast_all",
-        )
-        values = lax.bitcast_convert_type(bits, np.float64)
-        return values[0], values[1:]
+            def on_bits(bits: Any) -> np.ndarray:
+                leaves, form = jax.tree.flatten(bits)
+                of_chains = [np.asarray(leaf).view(np.float64)[..., 0] for leaf in leaves]
+                more = of_chains[0].ndim - n_axes[0]  # axes that `jax.vmap` has added
+                shape = of_chains[0].shape[: more + 1]
+                flat = [array.reshape(-1, *array.shape[more + 1 :]) for array in of_chains]
+                log_p = log_density(jax.tree.unflatten(form, flat))
+                return log_p.reshape(*shape, 1).view(np.uint32)
 
-    log_density = jax.custom_vjp(lambda z: found(z)[0])
-    log_density.defvjp(found, lambda slopes, slope: (slope * slopes,))
-    return lambda z, _: log_density(z)
+            bits = jax.pure_callback(
+                on_bits,
+                jax.ShapeDtypeStruct((len(x) + 1, 2), np.uint32),
+                jax.tree.map(lambda array: lax.bitcast_convert_type(array, np.uint32), arrays),
+                vmap_method="broadcast_all",
+            )
+            log_p = lax.bitcast_convert_type(bits, np.float64)
+            slopes = (log_p[1:] - log_p[0]) / _STEP
+            is_finite = jnp.isfinite(log_p).all()
+            return jnp.where(is_finite, log_p[0], -jnp.inf), jnp.where(is_finite, slopes, 0.0)
+
+        with_slopes = jax.custom_vjp(lambda x: found(x)[0])
+        with_slopes.defvjp(found, lambda slopes, slope: (slope * slopes,))
+        return with_slopes(x)
+
+    return of_data
 
 
 def _program(

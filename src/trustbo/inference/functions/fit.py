@@ -21,7 +21,6 @@ from trustbo.inference.functions.draws import (
 )
 from trustbo.inference.functions.function import FunctionModel, in_batches
 from trustbo.inference.functions.sampling import (
-    NUTS,
     keys_of,
     require_gradient,
     sampled,
@@ -75,8 +74,6 @@ def fit_function(
         require_plannable(model, workspace)
     require_fittable(model, data, known.sites, [len(mission.bounds) for mission in missions])
     effects = known.effects.effects
-    if effects:
-        _require_integrable(model, options.sampler)
 
     prior = known.run("prior", keys_of(N_PRIOR, options.seed + OF_PRIOR))
     targets = targets_of(model, data, known.sites, known.effects if effects else None)
@@ -124,15 +121,6 @@ def fit_function(
         complaints=drawn.complaints,
         source=lambda tree: OfFunction.stored(known, tree),
     )
-
-
-def _require_integrable(model: FunctionModel, sampler: str) -> None:
-    """Raise TrustboError if a sampler does not integrate the effects of a function out."""
-    if sampler == NUTS:
-        raise TrustboError(
-            f"{model.in_short()} has effects, which only importance sampling integrates out; use "
-            'sampler="auto".'
-        )
 
 
 def _all_equal(observations: Observations) -> bool:
@@ -262,9 +250,7 @@ def require_learnable(model: FunctionModel, workspace: Workspace, *, by_gradient
     if model.needs_observations:
         data["observations"] = observations_of(data)
     sites = model.sites(data)
-    if by_gradient:
-        if model.effects(data):
-            _require_integrable(model, NUTS)
+    if by_gradient and not model.effects(data):
         require_gradient(targets_of(model, data, sites)[0])
     if not model.needs_observations:  # its data are not padded
         require_unpadded_results(model, data, sites, [len(known)])

@@ -20,7 +20,7 @@ from trustbo.inference.functions.explain import reason_of
 from trustbo.inference.functions.function import FunctionModel, Outer, in_batches
 from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.importance import Points
-from trustbo.inference.nuts import Chains, Samples, Start, Tuning
+from trustbo.inference.nuts import Chains, Compiled, Samples, Start, Tuning, compiled_with, in_jax
 from trustbo.inference.options import Options
 from trustbo.inference.params import joined_draws
 from trustbo.models.backend import own_settings
@@ -99,17 +99,33 @@ class Target:
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, coordinate)."""
-        if self.effects is not None:
-            log_p, space, inputs, theta = self._given(x)
-            return log_p + self.effects.log_evidence(space, inputs, theta)
+        if self.effects is None:
+            return self._in_batches("log density", self.traced, x)
+        return self._with_evidence(self.outer(x))
 
-        return self._in_batches("log density", self.traced, x)
+    def outer(self, x: np.ndarray) -> Outer:
+        """Return the results of the function without its effects and rates at points."""
+        return self._in_batches("outer", self._outer, x)
 
     def traced(self, x: Any, data: Data) -> Any:
         """Compute the log density, up to a constant, at coordinates (coordinate,) in JAX."""
+        if self.effects is not None:
+            return in_jax(self._outer, self._with_evidence)(x, data)
+
         z = self.coordinates.unconstrained(x)
         log_jacobian = self.coordinates.log_jacobian(x)
         return log_jacobian - self.model.potential(z, data, self.coordinates.deviations)
+
+    def _outer(self, x: Any, data: Data) -> Outer:
+        """Run the function at coordinates (coordinate,) in JAX, but for its effects and rates."""
+        z = self.coordinates.unconstrained(x)
+        found = self.model.outer(z, data, self.coordinates.deviations)
+        return found._replace(log_p=found.log_p + self.coordinates.log_jacobian(x))
+
+    def _with_evidence(self, outer: Outer) -> np.ndarray:
+        """Add the log evidence of the rates (point,), with the effects integrated out."""
+        effects: Any = self.effects
+        return outer.log_p + effects.log_evidence(*self._given(outer))
 
     def draw_effects(
         self, x: np.ndarray, rng: np.random.Generator
@@ -117,24 +133,15 @@ class Target:
         """Draw the effects of the function, if it has any, at points (draw, coordinate)."""
         if self.effects is None:
             return None
-        _, space, inputs, theta = self._given(x)
-        return self.effects.draw(space, inputs, theta, rng)
+        return self.effects.draw(*self._given(self.outer(x)), rng)
 
-    def _given(self, x: np.ndarray) -> tuple[np.ndarray, StateSpace, Inputs, dict[str, np.ndarray]]:
-        """Return the log density without rates, and the arguments of `AddedEffects`, at points."""
-        of_points = self.coordinates
-        deviations = of_points.deviations
-
-        def one(x: Any, data: Data) -> Any:
-            found = self.model.outer(of_points.unconstrained(x), data, deviations)
-            return found._replace(log_p=found.log_p + of_points.log_jacobian(x))
-
-        found: Outer = self._in_batches("outer", one, x)
+    def _given(self, outer: Outer) -> tuple[StateSpace, Inputs, dict[str, np.ndarray]]:
+        """Return what `AddedEffects` takes at points, without the padding."""
         effects: Any = self.effects
         shape = effects.observations.contact_rate.shape
-        given = (value[:, : shape[0], : shape[1]].reshape(-1, *shape) for value in found.inputs)
-        fields = [None if value is None else value[:, 0] for value in found.space]
-        return found.log_p, StateSpace(*fields), Inputs(*given), found.theta
+        inputs = (value[:, : shape[0], : shape[1]].reshape(-1, *shape) for value in outer.inputs)
+        fields = [None if value is None else value[:, 0] for value in outer.space]
+        return StateSpace(*fields), Inputs(*inputs), outer.theta
 
     def points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Convert values (draw, ...) of the variables to coordinates (draw, coordinate)."""
@@ -164,6 +171,13 @@ class Target:
         """Return a function of draws, compiled for these data; see `compiled_over_draws`."""
         key = *key, self.coordinates.key
         return self.model.compiled_over_draws(key, compute, n_draw_axes, self.data)
+
+    @property
+    def compiled_for_nuts(self) -> Compiled:
+        """Compiles functions of chains; again for each fit if NumPy computes a part of them."""
+        if self.effects is None:
+            return self.compiled
+        return lambda _, compute, n: compiled_with(compute, n, self.data)
 
     def finite_points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return `points`, without draws that have infinite coordinates."""
@@ -222,11 +236,13 @@ def sampled(
             charts = [_chart(one, scaled[0], starts) for one in scaled]
             found = sample_charts(charts, seed, target.coordinates.names)
             found = found._replace(x=scaled[0].unscaled(found.x))
-        has_effects = target.effects is not None  # these have no gradient
-        if sampler == IMPORTANCE or has_effects or (sampler == AUTO and not found.complaints):
+        is_slow = target.effects is not None  # NUTS would take many minutes
+        is_enough = sampler == AUTO and (is_slow or not found.complaints)
+        if sampler == IMPORTANCE or is_enough:
             return _resampled(target, found, options.chains * draws, seed)
 
-    require_gradient(target)
+    if target.effects is None:
+        require_gradient(target)
     if found is None:
         x = target.finite_points(known or prior)
     else:
@@ -372,12 +388,12 @@ def _by_nuts(
     tuning = Tuning(warmup, _ACCEPT)
     options: dict[str, Any] = {"seed": seed, "progress": progress}
     options["who"] = target.model.in_short()
-    chains = Chains(target.traced, target.compiled, tuning, **options)
+    chains = Chains(target.traced, target.compiled_for_nuts, tuning, **options)
     samples = chains.run(start, draws)
     if check and samples.fields["diverging"].mean() > _TOLERATED:
         start = Start.near(samples.points, len(start.x), seed + 1)
         tuning = Tuning(warmup, _LAST_ACCEPT)
-        chains = Chains(target.traced, target.compiled, tuning, **options)
+        chains = Chains(target.traced, target.compiled_for_nuts, tuning, **options)
         samples = chains.run(start, draws)
 
     patient = False
@@ -399,7 +415,8 @@ def _by_nuts(
     statistics = statistics_of(samples.fields)
     if not verdict.complaints:
         _warn(target.model, verdict, statistics["diverging"].size)
-    return Drawn(target.values(samples.points), statistics, attrs, verdict.complaints)
+    effects = target.draw_effects(samples.points, stream(seed, "draws of effects"))
+    return Drawn(target.values(samples.points), statistics, attrs, verdict.complaints, effects)
 
 
 def _judge(target: Target, samples: Samples, *, patient: bool, last: bool = False) -> Verdict:
