@@ -23,7 +23,6 @@ from scipy.special import logit
 
 from trustbo.hazard.components import Components
 from trustbo.models import TrustParams
-from trustbo.models.params import CoupledParams, RobotParams
 from trustbo.planning import InfeasibleError, Planner
 from trustbo.workspace import Workspace
 from trustbo.workspace.awareness import labelled_onward
@@ -90,7 +89,8 @@ def draw_model(rng, z, kind):
         B0 = np.diag(beta0 * rng.uniform(0.6, 1.0, n)) + rng.uniform(0.0, 0.1, (n, n))
         B = numbers(rng, kind, (2, n, n))
         u = np.einsum("mab,bdrcm->adrc", B, z) + b[:, None, None, None]
-        params = CoupledParams(B0, B, b, 0.01 * np.eye(n), sd**2 * np.eye(n), x0)
+        noises = {"Delta_w": 0.01 * np.eye(n), "Delta_v": sd**2 * np.eye(n)}
+        params = TrustParams(B0=B0, B=B, b=b, **noises, x0_mean=x0)
         return params, u, B0, np.full(n, x0), sd, B[1]
     u, places = np.zeros(z.shape[:-1]), {}
     if rng.random() < 0.3:
@@ -102,7 +102,7 @@ def draw_model(rng, z, kind):
         beta, own = numbers(rng, kind, (n, 2)), beta0 * rng.uniform(0.6, 1.0, n)
         u = u + np.einsum("im,idrcm->idrc", beta, z) + b[:, None, None, None]
         sds = sd * rng.uniform(0.5, 1.0, n)
-        params = RobotParams(own, beta, b, np.full(n, 0.1), sds, x0, **places)
+        params = TrustParams(own, beta, b, np.full(n, 0.1), sds, x0, **places, per_robot=True)
         return params, u, np.diag(own), np.full(n, x0), float(sds.mean()), np.diag(beta[:, 1])
     beta = numbers(rng, kind, 2)
     params = TrustParams(beta0, beta, b[0], 0.1, sd, x0, **places)

@@ -181,7 +181,7 @@ def _equations_of_draws(params, awareness, path=None, *, x0=None):
     """Form, drift and offset (draw, bound, robot) of a mission under draws of parameters.
 
     Args:
-        params: `TrustParams`, `RobotParams` or `CoupledParams`, whose fields (draw, ...) are read.
+        params: `TrustParams`, whose fields (draw, ...) are read.
         awareness: Awareness (bound, robot, feature).
         path: Cells from the start on; needed with effects of places.
         x0: Trust before the first bound, if it is known, shape () or (robot,).
@@ -206,7 +206,7 @@ def _equations_of_draws(params, awareness, path=None, *, x0=None):
         return form, u, np.zeros_like(u)
 
     def diagonal(values):
-        if type(params).__name__ == "TrustParams":  # of all robots
+        if not params.per_robot:
             values = np.asarray(values)[..., None]
         return values[..., None] * own
 
@@ -221,15 +221,15 @@ def _equations_of_draws(params, awareness, path=None, *, x0=None):
 
 def weighted(params, z, i):
     """Intercept and weighted awareness (...,) of robot i in a bound, for awareness z."""
-    total = params.b if type(params).__name__ == "TrustParams" else params.b[..., i]
+    total = params.b if params.b.ndim == 1 else params.b[..., i]
     for m in range(z.shape[1]):
         if hasattr(params, "B0"):
             for j in range(len(z)):
                 total = total + params.B[..., m, i, j] * z[j, m]
-        elif type(params).__name__ == "TrustParams":
-            total = total + params.beta[..., m] * z[i, m]
-        else:
+        elif params.per_robot:
             total = total + params.beta[..., i, m] * z[i, m]
+        else:
+            total = total + params.beta[..., m] * z[i, m]
     return total
 
 

@@ -13,7 +13,6 @@ from trustbo.models import (
     TrustParams,
 )
 from trustbo.models.observations import Observations
-from trustbo.models.params import CoupledParams, RobotParams
 from trustbo.models.visited import visited
 
 FEATURES = ("line_of_sight", "vegetation")
@@ -76,8 +75,8 @@ def draws_of(kind, *, n_draws=3, n_robots=3, shape=GRID, seed=0):
         root_w, root_v = 0.06 * rng.normal(size=(2, n_draws, n_robots, n_robots))
         own = 0.005 * np.eye(n_robots)
         b = rng.uniform(0.2, 0.3, (n_draws, n_robots))
-        noises = root_w @ root_w.mT + own, root_v @ root_v.mT + own
-        return CoupledParams(B0, B, b, *noises, *x0, **places)
+        noises = {"Delta_w": root_w @ root_w.mT + own, "Delta_v": root_v @ root_v.mT + own}
+        return TrustParams(B0=B0, B=B, b=b, **noises, x0_mean=x0[0], x0_sd=x0[1], **places)
 
     memory = "deviation" if "deviation" in words else "level"
     gain = 1.0 if memory == "deviation" else 1.0 - beta0
@@ -94,7 +93,7 @@ def draws_of(kind, *, n_draws=3, n_robots=3, shape=GRID, seed=0):
     gain = np.ones_like(beta0) if memory == "deviation" else 1.0 - beta0
     beta = gain[..., None] * rng.uniform(0.0, 0.25, (n_draws, n_robots, 2))
     noises = rng.uniform(0.05, 0.2, (2, n_draws, n_robots))
-    return RobotParams(beta0, beta, 0.3 * gain, *noises, *x0, **options)
+    return TrustParams(beta0, beta, 0.3 * gain, *noises, *x0, per_robot=True, **options)
 
 
 KINDS = [

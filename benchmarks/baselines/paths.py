@@ -12,7 +12,7 @@ import numpy as np
 from trustbo.campaign.campaign import Campaign
 from trustbo.data import LINE_OF_SIGHT, Cell, Mission
 from trustbo.models.families import FAMILIES
-from trustbo.models.params import Params
+from trustbo.models.params import TrustParams
 from trustbo.planning import Plan, Planner
 from trustbo.planning.objectives import Weights
 from trustbo.planning.problem import Problem
@@ -30,7 +30,7 @@ class PathPolicy:
     `best(planner)`, the path that it recommends; and `learn`, which does nothing here.
     """
 
-    def __call__(self, rng: np.random.Generator, params: Params, planner: Planner) -> Plan:
+    def __call__(self, rng: np.random.Generator, params: TrustParams, planner: Planner) -> Plan:
         """Plan the next mission."""
         return planner.evaluate(self.choose(planner, rng), params.mean())
 

@@ -13,7 +13,6 @@ import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import TrustFilter, fit, params_of
 from trustbo.models import HierarchicalTrust, PooledTrust, TrustParams
-from trustbo.models.params import CoupledParams
 
 
 @pytest.fixture(scope="module")
@@ -248,14 +247,14 @@ def test_counts_need_their_numbers_of_ticks():
 @pytest.mark.parametrize("family", ["gaussian", "censored", "beta_binomial"])
 def test_coupled_robots_without_a_coupling_are_robots_apart(family):
     p, rng, eye = OF_FAMILY[family], np.random.default_rng(1), np.eye(2)[None]
-    coupled = CoupledParams(
-        p.beta0 * eye,
-        p.beta[..., None, None] * np.eye(2),
-        np.full((1, 2), p.b),
-        p.delta_w**2 * eye,
-        p.delta_v**2 * eye,
-        p.x0_mean,
-        p.x0_sd,
+    coupled = TrustParams(
+        B0=p.beta0 * eye,
+        B=p.beta[..., None, None] * np.eye(2),
+        b=np.full((1, 2), p.b),
+        Delta_w=p.delta_w**2 * eye,
+        Delta_v=p.delta_v**2 * eye,
+        x0_mean=p.x0_mean,
+        x0_sd=p.x0_sd,
         family=family,
     )
     together = TrustFilter(coupled)

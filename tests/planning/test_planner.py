@@ -15,7 +15,6 @@ from trustbo.hazard.components import Components
 from trustbo.inference import fit, params_of, sample_prior
 from trustbo.inference.place_maps import place_maps_of
 from trustbo.models import PooledTrust, TrustParams
-from trustbo.models.params import CoupledParams, RobotParams
 from trustbo.planning import OBJECTIVES, Planner, expected_trust
 from trustbo.planning.paths import STEPS
 from trustbo.simulation import ModelSimulator
@@ -159,11 +158,20 @@ def problem_without_memory(rng, objective, **options):
     params = {
         "pooled": TrustParams(0.0, rng.normal(0.0, scale, 2), b[0], 0.1, sd),
         "deviation": TrustParams(0.6, rng.normal(0.0, scale, 2), b[0], 0.1, sd, memory="deviation"),
-        "robots": RobotParams(
-            np.zeros(n), rng.normal(0.0, scale, (n, 2)), b, np.full(n, 0.1), np.full(n, sd)
+        "robots": TrustParams(
+            np.zeros(n),
+            rng.normal(0.0, scale, (n, 2)),
+            b,
+            np.full(n, 0.1),
+            np.full(n, sd),
+            per_robot=True,
         ),
-        "coupled": CoupledParams(
-            np.zeros((n, n)), rng.normal(0.0, scale, (2, n, n)), b, np.eye(n), sd**2 * np.eye(n)
+        "coupled": TrustParams(
+            B0=np.zeros((n, n)),
+            B=rng.normal(0.0, scale, (2, n, n)),
+            b=b,
+            Delta_w=np.eye(n),
+            Delta_v=sd**2 * np.eye(n),
         ),
     }[str(rng.choice(["pooled", "deviation", "robots", "coupled"]))]
 

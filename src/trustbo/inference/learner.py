@@ -322,9 +322,9 @@ def params_of(
             in this process.
 
     Returns:
-        `TrustParams`, `RobotParams` or `CoupledParams`, depending on the model. A pooled model with
-        robot effects gives `RobotParams` for the next mission. Their line-of-sight weights include
-        each robot's effect, whose slow part has decayed by one mission. A function gives `Draws`.
+        `TrustParams` of the form of the model. Those of a pooled model with robot effects are given
+        for each robot (`per_robot`), because its line-of-sight weights include its own effect,
+        whose slow part has decayed by one mission. A function gives `Draws`.
 
     Raises:
         TrustboError: If the posterior is not from `fit`; a variable is missing or has NaN draws; or

@@ -27,7 +27,7 @@ from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.model import TrustModel
 from trustbo.models.observations import Observations
-from trustbo.models.params import Params, assemble_params
+from trustbo.models.params import TrustParams, assemble_params
 from trustbo.models.record import effects_from_record, model_from_record, with_default_priors
 from trustbo.models.visited import visited
 from trustbo.stacking import require_same_team
@@ -150,7 +150,7 @@ def require_variables(needed: Iterable[str], found: Iterable[Hashable]) -> None:
 
 def read_params(
     posterior: xr.DataTree, workspace: Workspace | None, next_mission: Sequence[bool]
-) -> list[Params]:
+) -> list[TrustParams]:
     """Return the parameters for each value of `next_mission`; see `params_of`."""
     if is_of_people(posterior):
         raise TrustboError(
@@ -200,7 +200,7 @@ def with_effects(
             and effects of robots in bounds are included. Otherwise, expected effects are used.
 
     Returns:
-        Pairs of the parameters, and of the arguments of `Params` with the effects of places.
+        Pairs of the parameters, and of the arguments of `TrustParams` with the effects of places.
     """
     places = posterior["places"].to_dataset() if "places" in posterior.children else None
     values = {effect: values_of(posterior, effect) for effect in _effects_of_robots(effects)}
@@ -549,7 +549,7 @@ def in_order_of_features(missions: Iterable[Mission], posterior: xr.DataTree) ->
 
 def sample_prior(
     model: TrustModel, n_features: int, n_draws: int, seed: int, *, n_robots: int = 1
-) -> Params:
+) -> TrustParams:
     """Draw parameters (draw, ...) from the prior, without effects.
 
     Args:
@@ -645,7 +645,7 @@ def with_prior_effects_ahead(
     return ahead.with_effects(group, values, 0, [False, True])
 
 
-def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Params:
+def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> TrustParams:
     """Compute the prior mean of the parameters without effects; see `sample_prior`."""
     prior = _prior(model, n_features, n_robots)
     rng = np.random.default_rng(0)
@@ -655,7 +655,7 @@ def prior_mean(model: TrustModel, n_features: int, *, n_robots: int = 1) -> Para
 
 
 def _settings_of(model: TrustModel) -> dict[str, Any]:
-    """Return the arguments of `Params` that are settings of a model."""
+    """Return the arguments of `TrustParams` that are settings of a model."""
     return {**model.x0, "memory": model.memory, "family": model.family}
 
 

@@ -10,14 +10,15 @@ from trustbo.models.effects.effect import Effect
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.effects.robot import RobotEffect
 from trustbo.models.hierarchical import HierarchicalTrust
-from trustbo.models.params import CoupledParams, RobotParams, TrustParams
+from trustbo.models.params import CoupledParams as CoupledParams
+from trustbo.models.params import RobotParams as RobotParams
+from trustbo.models.params import TrustParams
 from trustbo.models.people import HumanTrust
 from trustbo.models.pooled import PooledTrust
 from trustbo.models.priors import Priors
 
 __all__ = [
     "ContactRate",
-    "CoupledParams",
     "CoupledTrust",
     "Effect",
     "HierarchicalTrust",
@@ -26,7 +27,6 @@ __all__ = [
     "PooledTrust",
     "Priors",
     "RobotEffect",
-    "RobotParams",
     "TrustParams",
     "default_model",
 ]

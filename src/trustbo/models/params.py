@@ -1,14 +1,14 @@
 """Parameters of the trust models with the symbols of the paper, as users give and read them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import xarray as xr
 
 from trustbo.arrays import Names, as_names, read_labelled, require_numbers
-from trustbo.errors import TrustboError, require_choice
+from trustbo.errors import TrustboError, require_choice, require_switch, warn
 from trustbo.models.draws import PLACES, Draws
 from trustbo.models.families import FAMILIES
 from trustbo.models.robots_in_bounds import RobotsInBounds
@@ -16,74 +16,48 @@ from trustbo.models.robots_in_bounds import RobotsInBounds
 Numbers = Any
 """A number or an array of numbers, which may have labels."""
 
-COUPLED_DIMS: Mapping[str, tuple[str, ...]] = {
+Dims = Mapping[str, tuple[str, ...]]
+"""Axes of each parameter after (draw,)."""
+
+POOLED_DIMS: Dims = {"beta0": (), "beta": ("feature",), "b": (), "delta_w": (), "delta_v": ()}
+"""Parameters that all robots share, equations (3)-(4)."""
+ROBOT_DIMS: Dims = {
+    "beta0": ("robot",),
+    "beta": ("robot", "feature"),
+    "b": ("robot",),
+    "delta_w": ("robot",),
+    "delta_v": ("robot",),
+}
+"""Parameters of each robot, without influence on each other."""
+COUPLED_DIMS: Dims = {
     "B0": ("robot", "robot_"),
     "B": ("feature", "robot", "robot_"),
     "b": ("robot",),
     "Delta_w": ("robot", "robot_"),
     "Delta_v": ("robot", "robot_"),
 }
-"""Axes of the parameters of the coupled model."""
-
-
-class LinearParams(Draws):
-    """Parameters of a model whose inputs are linear in awareness."""
-
-    dims: ClassVar[Mapping[str, tuple[str, ...]]]
-    """Axes of each parameter after (draw,); parameters that are not listed have none."""
-
-    def _set(
-        self,
-        values: Mapping[str, Numbers],
-        place_robot: RobotsInBounds | None,
-        robots: Sequence[str] | None,
-        features: Sequence[str] | None,
-        family: str,
-        memory: str = "level",
-    ) -> None:
-        """Read the arguments of a subclass; values that are None are left out.
-
-        Raises:
-            TrustboError: If a value is not a number, is infinite or exceeds 1e12, if sizes, labels
-                or names differ, or if the family is unknown. Effects of places may be NaN where a
-                map has no bound.
-        """
-        require_choice("family", family, FAMILIES)
-        own_robots = as_names("robots", robots or ()) or None
-        own_features = as_names("features", features or ()) or None
-        names = {"robot": own_robots, "robot_": own_robots, "feature": own_features}
-        given = {name: value for name, value in values.items() if value is not None}
-        arrays = _arrays_of(given, self.dims, names)
-        Draws.__init__(self, arrays, None, place_robot, own_robots, own_features, memory, family)
-
-    @property
-    def arguments(self) -> dict[str, Any]:
-        """Arguments that make these parameters."""
-        others = ("place_robot", "robots", "features", "family")
-        return {**self.arrays, **{name: getattr(self, name) for name in others}}
-
-    def replace(self, **changes: Any) -> Self:
-        """Return the parameters with other values of some arguments.
-
-        Example:
-            >>> forgetful = params.replace(beta0=0.0)
-        """
-        return type(self)(**(self.arguments | changes))
+"""Parameters of the coupled model, equations (1)-(2)."""
+_NOT_COUPLED = ("delta_s", "f_v", "memory", "per_robot")
+"""Further arguments that the coupled model does not have."""
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class TrustParams(LinearParams):
-    """Parameters of the pooled model, equations (3)-(4).
+class TrustParams(Draws):
+    """Parameters of a trust model whose inputs are linear in awareness.
+
+    There are three forms. By default, all robots share the parameters beta0, beta, b, delta_w and
+    delta_v of equations (3)-(4). With `per_robot`, these have an axis (robot,). The coupled model,
+    equations (1)-(2), has the parameters B0, B, b, Delta_w and Delta_v.
 
     Each parameter is one number or array, or has the leading axis (draw,). It can be read by name,
     always with this axis.
 
     Args:
-        beta0: Autoregression coefficient.
-        beta: Feature weights, shape (feature,) or (draw, feature).
-        b: Intercept.
-        delta_w: Standard deviation of the process noise.
-        delta_v: Standard deviation of the observation noise.
+        beta0: Autoregression coefficient, shape () or (draw,); with `per_robot`, (..., robot).
+        beta: Feature weights, shape (..., feature); with `per_robot`, (..., robot, feature).
+        b: Intercept, of the shape of beta0; shape (..., robot) in the coupled model.
+        delta_w: Standard deviation of the process noise, of the shape of beta0.
+        delta_v: Standard deviation of the observation noise, of the shape of beta0.
         x0_mean: Mean of trust before the first bound.
         x0_sd: Standard deviation of trust before the first bound.
         place: Effects of entered cells, shape (..., effect, row, col), or None. The axis `effect`
@@ -101,27 +75,38 @@ class TrustParams(LinearParams):
             one is line of sight.
         family: Observation family of the contact rates, `"gaussian"`, `"censored"` or
             `"beta_binomial"`; see `PooledTrust`. Parameters of a posterior have that of its model.
+        per_robot: Whether beta0, beta, b, delta_w and delta_v have an axis of robots.
+        B0: Influence of each robot' on each robot, shape (..., robot, robot').
+        B: Feature weights of the coupled model, shape (..., feature, robot, robot').
+        Delta_w: Covariance of its process noise, shape (..., robot, robot').
+        Delta_v: Covariance of its observation noise, shape (..., robot, robot').
 
     Raises:
-        TrustboError: If a value is not a number, is infinite or exceeds 1e12, if sizes or names
-            differ, or if the family is unknown. An array with labels needs the names `robots` or
-            `features`.
+        TrustboError: If parameters of a form are missing or belong to another form; if a value is
+            not a number, is infinite or exceeds 1e12; if sizes or names differ; if a covariance is
+            not symmetric and positive definite; or if the family is unknown. An array with labels
+            needs the names `robots` or `features`. Effects of places may be NaN where a map has no
+            bound.
 
     Example:
         >>> beta = np.array([0.1, 0.1, 0.3])  # of traversability, visibility and line of sight
         >>> truth = tb.models.TrustParams(0.5, beta, b=0.0, delta_w=0.05, delta_v=0.05)
         >>> tb.simulation.ModelSimulator(workspace, truth).run(path, seed=0).contact_rate
+        >>> beta = np.tile(beta, (3, 1))  # (robot, feature)
+        >>> beta[1] /= 2.0  # r2 detects less
+        >>> half, noise = np.full(3, 0.5), np.full(3, 0.05)
+        >>> params = tb.models.TrustParams(half, beta, np.zeros(3), noise, noise, per_robot=True)
+        >>> planner.plan(params).trust.mean(axis=0).argmin().item()
+        1
     """
-
-    dims: ClassVar = {"beta": ("feature",), **PLACES}
 
     def __init__(
         self,
-        beta0: Numbers,
-        beta: Numbers,
-        b: Numbers,
-        delta_w: Numbers,
-        delta_v: Numbers,
+        beta0: Numbers | None = None,
+        beta: Numbers | None = None,
+        b: Numbers | None = None,
+        delta_w: Numbers | None = None,
+        delta_v: Numbers | None = None,
         x0_mean: Numbers = 0.5,
         x0_sd: Numbers = 0.5,
         place: Numbers | None = None,
@@ -133,13 +118,23 @@ class TrustParams(LinearParams):
         features: Sequence[str] | None = None,
         f_v: Numbers | None = None,
         family: str = "gaussian",
+        *,
+        per_robot: bool = False,
+        B0: Numbers | None = None,
+        B: Numbers | None = None,
+        Delta_w: Numbers | None = None,
+        Delta_v: Numbers | None = None,
     ) -> None:
         values = {
             "beta0": beta0,
             "beta": beta,
+            "B0": B0,
+            "B": B,
             "b": b,
             "delta_w": delta_w,
             "delta_v": delta_v,
+            "Delta_w": Delta_w,
+            "Delta_v": Delta_v,
             "x0_mean": x0_mean,
             "x0_sd": x0_sd,
             "place": place,
@@ -147,108 +142,104 @@ class TrustParams(LinearParams):
             "delta_s": delta_s,
             "f_v": f_v,
         }
-        self._set(values, place_robot, robots, features, family, memory)
+        given = {name: value for name, value in values.items() if value is not None}
+        named = set(given)
+        if memory != "level":
+            named.add("memory")
+        if require_switch("per_robot", per_robot):
+            named.add("per_robot")
+        form = _form_of(named)
+
+        require_choice("family", family, FAMILIES)
+        own_robots = as_names("robots", robots or ()) or None
+        own_features = as_names("features", features or ()) or None
+        names = {"robot": own_robots, "robot_": own_robots, "feature": own_features}
+        arrays = _arrays_of(given, {**form, **PLACES}, names)
+        for name in ("Delta_w", "Delta_v"):
+            if name in form:
+                _require_covariance(name, arrays[name])
+        super().__init__(arrays, None, place_robot, own_robots, own_features, memory, family)
+
+    @property
+    def per_robot(self) -> bool:
+        """Whether beta0, beta, b, delta_w and delta_v have an axis of robots."""
+        return "B0" not in self.arrays and self.arrays["b"].ndim > 1
+
+    @property
+    def dims(self) -> Dims:
+        """Axes of each parameter after (draw,); parameters that are not listed have none."""
+        given = {*self.arrays, "per_robot"} if self.per_robot else {*self.arrays}
+        return {**_form_of(given), **PLACES}
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """See `LinearParams.arguments`."""
-        return super().arguments | {"memory": self.memory}
+        """Arguments that make these parameters."""
+        others = ("place_robot", "robots", "features", "memory", "family", "per_robot")
+        return {**self.arrays, **{name: getattr(self, name) for name in others}}
+
+    def replace(self, **changes: Any) -> Self:
+        """Return the parameters with other values of some arguments.
+
+        Example:
+            >>> forgetful = params.replace(beta0=0.0)
+        """
+        return type(self)(**(self.arguments | changes))
 
 
-@dataclass(frozen=True, init=False, eq=False, repr=False)
-class RobotParams(TrustParams):
-    """Parameters of robots with separate coefficients and no influence on each other.
+def assemble_params(variables: Mapping[str, np.ndarray], **others: Any) -> TrustParams:
+    """Make parameters from variables (draw, ...) of a model, of which others are left out.
 
-    The arguments are those of `TrustParams`, but beta has the shape (..., robot, feature), and
-    beta0, b, delta_w and delta_v have the shape (..., robot).
-
-    Example:
-        >>> beta = np.tile([0.1, 0.1, 0.3], (3, 1))  # (robot, feature)
-        >>> beta[1] /= 2.0  # r2 detects less
-        >>> half, noise = np.full(3, 0.5), np.full(3, 0.05)
-        >>> params = tb.models.RobotParams(half, beta, np.zeros(3), noise, noise)
-        >>> planner.plan(params).trust.mean(axis=0).argmin().item()
-        1
+    The hierarchical model has variables that all robots share; these are repeated for each robot.
+    `others` are further arguments of `TrustParams`.
     """
+    if "B0" in variables:
+        return TrustParams(**{name: variables[name] for name in COUPLED_DIMS}, **others)
 
-    dims: ClassVar = {
-        "beta": ("robot", "feature"),
-        **dict.fromkeys(("beta0", "b", "delta_w", "delta_v"), ("robot",)),
-        **PLACES,
+    names = (*POOLED_DIMS, "delta_s", "f_v")
+    values = {name: variables[name] for name in names if name in variables}
+    b = values["b"]
+    if b.ndim > 1:
+        for name in ("beta0", "delta_w", "delta_v"):
+            values[name] = np.broadcast_to(values[name][:, None], b.shape)
+    return TrustParams(**values, per_robot=b.ndim > 1, **others)
+
+
+def RobotParams(*arguments: Any, **options: Any) -> TrustParams:  # noqa: N802
+    """Deprecated; use `TrustParams` with `per_robot=True`."""
+    warn("RobotParams is deprecated; use TrustParams(..., per_robot=True).")
+    return TrustParams(*arguments, **options, per_robot=True)
+
+
+def CoupledParams(*arguments: Any, **options: Any) -> TrustParams:  # noqa: N802
+    """Deprecated; use `TrustParams` with B0, B, b, Delta_w and Delta_v by name."""
+    warn("CoupledParams is deprecated; use TrustParams(B0=, B=, b=, Delta_w=, Delta_v=).")
+    settings = ("x0_mean", "x0_sd", "place", "place_bound", "place_robot", "robots", "features")
+    names = (*COUPLED_DIMS, *settings, "family")
+    return TrustParams(**dict(zip(names, arguments, strict=False)), **options)
+
+
+def _form_of(given: Collection[str]) -> Dims:
+    """Return the axes of the five parameters of a form, from the names of given arguments.
+
+    Raises TrustboError if one of them is missing, or if an argument belongs to another form.
+    """
+    linear = POOLED_DIMS.keys() & given
+    coupled = COUPLED_DIMS.keys() & given
+    is_coupled = len(coupled) > len(linear)
+    form = COUPLED_DIMS if is_coupled else ROBOT_DIMS if "per_robot" in given else POOLED_DIMS
+
+    foreign = (*POOLED_DIMS, *_NOT_COUPLED) if is_coupled else COUPLED_DIMS
+    wrong = {
+        "missing": [name for name in form if name not in given],
+        "not of this form": [name for name in foreign if name in given and name not in form],
     }
-
-
-@dataclass(frozen=True, init=False, eq=False, repr=False)
-class CoupledParams(LinearParams):
-    """Parameters of the coupled model, equations (1)-(2).
-
-    The shapes are B0 (..., robot, robot'), B (..., feature, robot, robot'), b (..., robot), and
-    (..., robot, robot') for the covariances Delta_w and Delta_v. The other arguments are the same
-    as those of `TrustParams`.
-
-    Raises:
-        TrustboError: As for `TrustParams`, or if a covariance is not symmetric and positive
-            definite.
-
-    Example:
-        >>> posterior = tb.fit(missions, tb.models.CoupledTrust())
-        >>> params = tb.inference.params_of(posterior)
-        >>> params.B0.mean(axis=0)  # influence of each robot on each other one
-    """
-
-    dims: ClassVar = {**COUPLED_DIMS, **PLACES}
-
-    def __init__(
-        self,
-        B0: Numbers,
-        B: Numbers,
-        b: Numbers,
-        Delta_w: Numbers,
-        Delta_v: Numbers,
-        x0_mean: Numbers = 0.5,
-        x0_sd: Numbers = 0.5,
-        place: Numbers | None = None,
-        place_bound: Numbers | None = None,
-        place_robot: RobotsInBounds | None = None,
-        robots: Sequence[str] | None = None,
-        features: Sequence[str] | None = None,
-        family: str = "gaussian",
-    ) -> None:
-        values = {
-            "B0": B0,
-            "B": B,
-            "b": b,
-            "Delta_w": Delta_w,
-            "Delta_v": Delta_v,
-            "x0_mean": x0_mean,
-            "x0_sd": x0_sd,
-            "place": place,
-            "place_bound": place_bound,
-        }
-        self._set(values, place_robot, robots, features, family)
-        for name in ("Delta_w", "Delta_v"):
-            _require_covariance(name, self.arrays[name])
-
-
-Params = TrustParams | RobotParams | CoupledParams
-
-
-def assemble_params(parameters: Mapping[str, np.ndarray], **others: Any) -> Params:
-    """Build parameters from variables (draw, ...) by name; `others` are further arguments."""
-    if "B0" in parameters:
-        others.pop("memory", None)  # is always "level"
-        return CoupledParams(**{name: parameters[name] for name in COUPLED_DIMS}, **others)
-
-    names = ("beta0", "beta", "b", "delta_w", "delta_v")
-    values: dict[str, Any] = {name: parameters[name] for name in names}
-    values |= {name: parameters.get(name) for name in ("delta_s", "f_v")}
-    n_robots = parameters["b"].shape[1:]
-    if not n_robots:
-        return TrustParams(**values, **others)
-
-    for name in ("beta0", "delta_w", "delta_v"):  # robots share these in the hierarchical model
-        values[name] = np.broadcast_to(values[name][:, None], parameters["b"].shape)
-    return RobotParams(**values, **others)
+    if any(wrong.values()):
+        found = "; ".join(f"{what}: {', '.join(names)}" for what, names in wrong.items() if names)
+        raise TrustboError(
+            f"parameters are {', '.join(POOLED_DIMS)}, or those of the coupled model, "
+            f"{', '.join(COUPLED_DIMS)}; {found}."
+        )
+    return form
 
 
 def _arrays_of(
