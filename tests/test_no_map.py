@@ -8,7 +8,7 @@ import pytest
 import trustbo as tb
 from trustbo.data import NOWHERE, Mission
 from trustbo.errors import TrustboError
-from trustbo.inference.params import missions_of
+from trustbo.inference.stored import missions_of
 from trustbo.logs import read_missions, read_table, to_frame, write_missions
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect
 from trustbo.models.record import model_from_record

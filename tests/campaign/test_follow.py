@@ -14,7 +14,7 @@ from worlds import random_cells
 import trustbo as tb
 from trustbo.campaign.learning import as_learned
 from trustbo.inference import TrustFilter
-from trustbo.inference.params import sample_prior_ahead
+from trustbo.inference.prior_draws import sample_prior_ahead
 from trustbo.models import PooledTrust
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,7 +11,7 @@ from worlds import random_cells
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import TrustFilter, params_of
-from trustbo.inference.params import as_fitted
+from trustbo.inference.order import as_fitted
 from trustbo.models import ContactRate, CoupledTrust
 
 PATH = [(4, 0), (3, 1), (2, 2), (1, 3), (0, 4)]

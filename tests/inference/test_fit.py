@@ -13,7 +13,8 @@ import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import add_latent, fit, importance, params_of, sample_prior
 from trustbo.inference.diagnostics import diagnostics
-from trustbo.inference.params import prior_mean, read_posterior, sample_prior_ahead
+from trustbo.inference.prior_draws import prior_mean, sample_prior_ahead
+from trustbo.inference.stored import read_posterior
 from trustbo.inference.tree import parameters_alone
 from trustbo.inference.variables import to_variables
 from trustbo.inference.weights import MAX_KHAT

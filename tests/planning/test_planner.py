@@ -114,7 +114,7 @@ def test_plan_of_a_posterior_reads_it_once_and_is_that_of_its_mean_and_draws(
         maps.append(place_maps_of(*arguments))
         return maps[-1]
 
-    monkeypatch.setattr("trustbo.inference.params.place_maps_of", counted)
+    monkeypatch.setattr("trustbo.inference.ahead.place_maps_of", counted)
     plan = planner.plan(posterior)
     assert len(maps) == 1
     assert (plan.path, plan.value) == (expected.path, expected.value)

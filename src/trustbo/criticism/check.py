@@ -9,20 +9,14 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from trustbo.arrays import joined_draws
 from trustbo.data import Mission, Station
 from trustbo.display import Rows, Summary, joined
 from trustbo.errors import TrustboError
-from trustbo.inference.params import (
-    is_by_position,
-    is_of_people,
-    joined_draws,
-    missions_of,
-    names_in,
-    parameters_of,
-    theta_of,
-)
 from trustbo.inference.place_maps import of_workspace
+from trustbo.inference.posterior import is_by_position, is_of_people, model_of, names_in
 from trustbo.inference.score import Posteriors, last_posterior, predictions, score
+from trustbo.inference.stored import missions_of, parameters_of
 from trustbo.models.families import FAMILIES
 from trustbo.parallel import computing
 from trustbo.stacking import list_of_missions
@@ -305,7 +299,8 @@ def _inverse_gain(posterior: xr.DataTree) -> np.ndarray | None:
     For a function, it is that of its variable `beta0`; None if there is no such variable.
     """
     if not is_by_position(posterior):
-        return theta_of(posterior, parameters_of(posterior))["inverse_gain"]
+        model = model_of(posterior)
+        return model.derived(parameters_of(posterior, model))["inverse_gain"]
     variables = posterior["posterior"].to_dataset()
     if "beta0" not in variables:
         return None

@@ -9,7 +9,7 @@ from trustbo.inference.filter import TrustFilter
 from trustbo.inference.fit import fit
 from trustbo.inference.learner import add_latent, params_of
 from trustbo.inference.loo import loo
-from trustbo.inference.params import sample_prior
+from trustbo.inference.prior_draws import sample_prior
 from trustbo.inference.reports import predict_reports
 from trustbo.inference.score import score
 

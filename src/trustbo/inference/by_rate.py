@@ -16,7 +16,8 @@ import xarray as xr
 from trustbo.arrays import evenly_spaced
 from trustbo.inference.latent import Source
 from trustbo.inference.learner import Model, learner_of_posterior
-from trustbo.inference.params import as_fitted, missions_of
+from trustbo.inference.order import as_fitted
+from trustbo.inference.stored import missions_of
 from trustbo.inference.tree import LIKELIHOOD_OF, RATES, TICKS
 from trustbo.parallel import computing
 from trustbo.statespace import kalman

@@ -29,7 +29,7 @@ from trustbo.inference.mixture import Mixture
 from trustbo.inference.modes import LogDensity, at_modes, climb, climb_on
 from trustbo.inference.nuts import sample_by_nuts
 from trustbo.inference.options import Options
-from trustbo.inference.params import parameters_of, stored_draws
+from trustbo.inference.stored import parameters_of, stored_draws
 from trustbo.inference.tree import Fitted, by_chain, default_draws
 from trustbo.inference.variables import prior_parameters, to_variables, with_prior_effects
 from trustbo.inference.weights import MAX_KHAT

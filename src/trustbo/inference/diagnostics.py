@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from arviz_stats import sampling_diagnostics
 
-from trustbo.inference.params import require_fitted
+from trustbo.inference.posterior import require_fitted
 
 MAX_RHAT = 1.01
 """Largest rank-normalised R-hat that is accepted for NUTS."""

@@ -11,7 +11,7 @@ from trustbo.arrays import Names, evenly_spaced, read_labelled
 from trustbo.data import Station, require_path, require_shares, require_unit_interval
 from trustbo.errors import TrustboError, one_line, require_whole
 from trustbo.inference.learner import params_of
-from trustbo.inference.params import as_fitted
+from trustbo.inference.order import as_fitted
 from trustbo.inference.weights import systematic
 from trustbo.models.draws import Draws
 from trustbo.models.observations import NO_TICKS

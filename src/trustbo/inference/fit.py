@@ -18,7 +18,8 @@ from trustbo.errors import (
 )
 from trustbo.inference.learner import as_learner
 from trustbo.inference.options import Options
-from trustbo.inference.params import as_fitted, names_in
+from trustbo.inference.order import as_fitted
+from trustbo.inference.posterior import names_in
 from trustbo.inference.tree import to_tree, with_latent
 from trustbo.models.default import default_model
 from trustbo.models.model import TrustModel

@@ -18,6 +18,7 @@ import xarray as xr
 
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_kind, require_switch, see
+from trustbo.inference.ahead import read_params
 from trustbo.inference.classes import (
     SAMPLERS,
     OfClass,
@@ -40,17 +41,10 @@ from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
 from trustbo.inference.functions.source import FunctionData, OfFunction
 from trustbo.inference.latent import Source
 from trustbo.inference.options import Options
-from trustbo.inference.params import (
-    as_fitted,
-    in_order_of_features,
-    missions_of,
-    names_in,
-    prior_mean,
-    read_params,
-    read_posterior,
-    sample_prior,
-    sample_prior_ahead,
-)
+from trustbo.inference.order import as_fitted, in_order_of_features
+from trustbo.inference.posterior import names_in
+from trustbo.inference.prior_draws import prior_mean, sample_prior, sample_prior_ahead
+from trustbo.inference.stored import missions_of, read_posterior
 from trustbo.inference.tree import Fitted, with_latent
 from trustbo.models.default import default_model
 from trustbo.models.draws import Draws, NextMission

@@ -36,7 +36,9 @@ from trustbo.inference.fit import fit
 from trustbo.inference.functions.fit import log_likelihood_of_function
 from trustbo.inference.functions.known import as_model, is_of_function, model_of_record
 from trustbo.inference.learner import Model, add_latent
-from trustbo.inference.params import as_fitted, missions_of, names_in, read_posterior
+from trustbo.inference.order import as_fitted
+from trustbo.inference.posterior import names_in
+from trustbo.inference.stored import missions_of, read_posterior
 from trustbo.inference.tree import LIKELIHOOD_OF, RATES, TICKS
 from trustbo.inference.weights import MAX_KHAT
 from trustbo.models.model import TrustModel

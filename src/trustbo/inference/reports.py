@@ -18,7 +18,9 @@ from trustbo.errors import (
 )
 from trustbo.inference.classes import OfClass
 from trustbo.inference.density import Density, JointDraws
-from trustbo.inference.params import QUANTILES, as_fitted, is_of_people, read_posterior
+from trustbo.inference.order import as_fitted
+from trustbo.inference.posterior import is_of_people
+from trustbo.inference.stored import read_posterior
 from trustbo.models.families import Family
 from trustbo.models.model import TrustModel
 from trustbo.parallel import computing
@@ -27,6 +29,8 @@ from trustbo.statespace import kalman
 from trustbo.statespace.blocks import each
 from trustbo.streams import stream
 
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+"""Quantiles of predictions."""
 _LEAST_MASS = 1e-300
 """Smallest probability of a report; its logarithm is finite."""
 _CLOSE = 1e-12

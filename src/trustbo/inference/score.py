@@ -10,7 +10,8 @@ import xarray as xr
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_whole
 from trustbo.inference.filter import TrustFilter
-from trustbo.inference.params import QUANTILES, as_fitted, in_order_of
+from trustbo.inference.order import as_fitted, in_order_of
+from trustbo.inference.reports import QUANTILES
 from trustbo.models.observations import Observations, require_ticks
 from trustbo.parallel import computing
 from trustbo.stacking import fill, list_of_missions, require_same_team

@@ -11,7 +11,7 @@ from trustbo.arrays import evenly_spaced
 from trustbo.data import NOWHERE, POST_SETS, Mission
 from trustbo.display import slow_bar
 from trustbo.inference.latent import N_TRAJECTORIES, Source, latent_of, replicate
-from trustbo.inference.params import transposed
+from trustbo.inference.order import transposed
 from trustbo.inference.place_maps import place_group
 from trustbo.models.backend import VERSIONS
 from trustbo.models.effects.effect import Effect

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from trustbo.errors import TrustboError, require_choice, require_kind, require_whole
-from trustbo.inference.params import as_fitted
+from trustbo.inference.order import as_fitted
 from trustbo.planning.plan import QUANTILES, Plan
 from trustbo.plots.style import (
     GREY,

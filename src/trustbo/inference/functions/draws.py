@@ -300,7 +300,7 @@ def draws_of_drift(
         drift: The drift.
         resolution: Resolution of the rates of the fit, if the function adds it to its noise.
         effects: Parameters and effects of places that are added to the drift; see
-            `inference.params.with_effects`.
+            `inference.ahead.with_effects`.
     """
     space = drift.space().with_noise(resolution)
     arrays = {name: value for name, value in space._asdict().items() if value is not None}

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from trustbo.arrays import joined_draws
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_kind
+from trustbo.inference.ahead import with_effects, with_prior_effects_ahead
 from trustbo.inference.density import at
 from trustbo.inference.functions.checks import require_fittable, require_unpadded_results
 from trustbo.inference.functions.data import data_of_bounds, observations_of
@@ -30,16 +32,9 @@ from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.functions.source import OF_PRIOR, FunctionData, OfFunction
 from trustbo.inference.latent import N_PRIOR
 from trustbo.inference.options import Options
-from trustbo.inference.params import (
-    effects_of,
-    in_order_of,
-    joined_draws,
-    names_in,
-    require_no_nan,
-    require_variables,
-    with_effects,
-    with_prior_effects_ahead,
-)
+from trustbo.inference.order import in_order_of
+from trustbo.inference.posterior import effects_of, names_in
+from trustbo.inference.stored import require_no_nan, require_variables
 from trustbo.inference.tree import Fitted, coords_of, default_draws
 from trustbo.models.draws import Draws, NextMission
 from trustbo.models.observations import Observations

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import xarray as xr
 
-from trustbo.arrays import evenly_spaced
+from trustbo.arrays import evenly_spaced, joined_draws
 from trustbo.display import joined as joined_names
 from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, warn
@@ -22,7 +22,6 @@ from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.importance import Points
 from trustbo.inference.nuts import Chains, Compiled, Samples, Start, Tuning, compiled_with, in_jax
 from trustbo.inference.options import Options
-from trustbo.inference.params import joined_draws
 from trustbo.models.backend import own_settings
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.streams import stream

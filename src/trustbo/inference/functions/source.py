@@ -7,7 +7,7 @@ from typing import Any, Self
 import numpy as np
 import xarray as xr
 
-from trustbo.arrays import evenly_spaced
+from trustbo.arrays import evenly_spaced, joined_draws
 from trustbo.data import Mission
 from trustbo.inference.density import at, chunks
 from trustbo.inference.functions.data import RATES, arrays_of, data_of
@@ -16,7 +16,7 @@ from trustbo.inference.functions.function import EFFECTS, Found, FunctionModel
 from trustbo.inference.functions.sampling import keys_of
 from trustbo.inference.functions.sites import Site, safe
 from trustbo.inference.latent import N_PRIOR, N_TRAJECTORIES, Given, Source, draw_exactly
-from trustbo.inference.params import joined_draws, values_of
+from trustbo.inference.stored import values_of
 from trustbo.models.effects.effect import Theta
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
