@@ -6,18 +6,19 @@ likelihood. The function is therefore run on a part of the data that needs no pa
 same part with padding. A third run, on the data, shows which rates and tick counts are observed.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from trustbo.errors import TrustboError
 from trustbo.inference.functions.data import RATES, Data, arrays_of, padded
-from trustbo.inference.functions.function import FunctionModel, Probe
-from trustbo.inference.functions.sites import Site, doubled
+from trustbo.inference.functions.function import FunctionModel
+from trustbo.inference.functions.sites import Site, doubled, latent_in
 from trustbo.models.backend import own_settings
 from trustbo.models.contact_rate import ParameterShapeError
+from trustbo.statespace import Inputs, StateSpace
 
 _N_DRAWS = 4
 """Number of draws from the prior for which the function is run."""
@@ -29,6 +30,23 @@ _MISSIONS_PER_PART = 4
 """Number of padded missions for each mission of the part; at least a quarter are not padding."""
 _SAME = 1e-5
 """Largest relative difference of results that should be equal; functions may use 32 bits."""
+
+
+class Probe(NamedTuple):
+    """Results of all sites of a function for one draw of its variables."""
+
+    space: StateSpace
+    inputs: Inputs
+    rates: Any
+    """Observed value of the site `contact_rate`, shape (mission, bound, robot)."""
+    n_ticks: Any
+    """Tick counts of its distribution, of the same shape; None if it has none."""
+    values: dict[str, Any]
+    """Latent variables."""
+    log_p: dict[str, Any]
+    """Log density of each sample site, in the shape of its plates."""
+    computed: dict[str, Any]
+    """Sites of `numpyro.deterministic`."""
 
 
 def require_fittable(
@@ -51,7 +69,7 @@ def require_fittable(
     else:
         values = require_unpadded_results(model, data, sites, n_bounds)
 
-    probe = model.over_draws("probe", 2, data)
+    probe = _probe(model, data)
     found: Probe = probe(values, _keys())
     _require_rates_of_data(model, data, found)
     if not values:  # otherwise, `require_unpadded_results` has checked it
@@ -72,7 +90,7 @@ def require_unpadded_results(
     part = _part_of(data, n_bounds)
     try:
         sites_of_part = model.sites(part)
-        wanted: Probe = model.over_draws("probe", 2, part)({}, _keys())
+        wanted: Probe = _probe(model, part)({}, _keys())
     except TrustboError as error:
         _require_no_shape_error(model, error)
         return {}
@@ -89,7 +107,7 @@ def require_unpadded_results(
 
     values = {name: _extended(v, sites[name].shape) for name, v in wanted.values.items()}
     with_padding = padded(part, np.shape(data[RATES])[:2])
-    probe = model.over_draws("probe", 2, with_padding)
+    probe = _probe(model, with_padding)
     found: Probe = probe(values, _keys())
     _require_rates_of_data(model, with_padding, found)
     _require_same_again(model, found, probe(values, _keys(_OTHER_SEED)))
@@ -97,6 +115,38 @@ def require_unpadded_results(
     _require_same_densities(model, wanted, found, sites, sites_of_part)
     _require_same_computed(model, wanted, found, list(model.computed_sites(data)))
     return values
+
+
+def _probe(model: FunctionModel, data: Data) -> Callable[..., Probe]:
+    """Return a compiled function of values and keys, with the axis (draw,), for these data.
+
+    Variables without values are drawn from the prior. The effects on the drift, which are not of
+    the function itself, are 0.
+    """
+
+    def one(values: Mapping[str, Any], key: jax.Array, data: Data) -> Probe:
+        trace = model.trace(values, key, data)
+        rates: Any = trace[RATES]["fn"]
+        if rates.effects:
+            trace[RATES]["fn"] = rates.given(np.zeros(rates.shape()))
+
+        log_p = {}
+        for name, site in trace.items():
+            if site["type"] == "sample":
+                scale = 1.0 if site["scale"] is None else site["scale"]
+                log_p[name] = scale * site["fn"].log_prob(site["value"])
+
+        return Probe(
+            space=rates.space_with_resolution,
+            inputs=rates.inputs,
+            rates=trace[RATES]["value"],
+            n_ticks=rates.n_ticks,
+            values={name: trace[name]["value"] for name in latent_in(trace)},
+            log_p=log_p,
+            computed={n: s["value"] for n, s in trace.items() if s["type"] == "deterministic"},
+        )
+
+    return model.compiled_over_draws(("probe",), one, 2, data)
 
 
 def _part_of(data: Data, n_bounds: Sequence[int]) -> dict[str, Any]:
