@@ -12,6 +12,7 @@ from trustbo.inference.order import in_order_of
 from trustbo.inference.place_maps import place_group, place_maps_of, robots_in_bounds_of
 from trustbo.inference.posterior import is_of_people, model_of, names_in
 from trustbo.inference.stored import parameters_of, require_variables, values_of
+from trustbo.models.draws import COUPLED_DIMS, ROBOT_DIMS
 from trustbo.models.effects.effect import Effect, Theta
 from trustbo.models.effects.place import PlaceEffect
 from trustbo.models.params import TrustParams, assemble_params
@@ -39,8 +40,7 @@ def read_params(
 
     model = model_of(posterior)
     parameters = parameters_of(posterior, model)
-    needed = ("B0", "B") if "B0" in parameters else ("beta0", "beta", "b", "delta_w", "delta_v")
-    require_variables(needed, parameters)
+    require_variables(COUPLED_DIMS if "B0" in parameters else ROBOT_DIMS, parameters)
 
     others = {name: posterior.attrs[name] for name in ("x0_mean", "x0_sd")}
     others["memory"] = posterior.attrs.get("memory", "level")

@@ -8,10 +8,10 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import Distribution
 
+from trustbo.models.draws import COUPLED_DIMS
 from trustbo.models.effects.effect import Theta
 from trustbo.models.effects.weights import CoupledWeights
 from trustbo.models.model import TrustModel
-from trustbo.models.params import COUPLED_DIMS
 from trustbo.statespace import StateSpace
 from trustbo.statespace.form import coupled_robots
 from trustbo.statespace.matrices import namespace

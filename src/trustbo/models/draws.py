@@ -17,16 +17,34 @@ from trustbo.models.sight_scale import scale_at, variation
 from trustbo.statespace import Inputs, StateSpace
 from trustbo.statespace.form import coupled_robots, independent_robots
 
-PLACES = {
+Dims = Mapping[str, tuple[str, ...]]
+"""Axes of each parameter after (draw,)."""
+
+ROBOT_DIMS: Dims = {
+    "beta0": ("robot",),
+    "beta": ("robot", "feature"),
+    "b": ("robot",),
+    "delta_w": ("robot",),
+    "delta_v": ("robot",),
+}
+"""Parameters of each robot, without influence on each other."""
+COUPLED_DIMS: Dims = {
+    "B0": ("robot", "robot_"),
+    "B": ("feature", "robot", "robot_"),
+    "b": ("robot",),
+    "Delta_w": ("robot", "robot_"),
+    "Delta_v": ("robot", "robot_"),
+}
+"""Parameters of the coupled model, equations (1)-(2)."""
+PLACES: Dims = {
     "place": ("effect", "row", "col"),
     "place_bound": ("effect", "move", "row", "col"),
 }
 """Axes of the effects of places; the first has one entry, or one for each robot."""
-_AXES = {
-    **dict.fromkeys(("beta0", "b", "delta_w", "delta_v", "x0_mean", "x0_sd"), ("robot",)),
-    **dict.fromkeys(("B0", "Delta_w", "Delta_v"), ("robot", "robot")),
-    "beta": ("robot", "feature"),
-    "B": ("feature", "robot", "robot"),
+_AXES: Dims = {
+    **ROBOT_DIMS,
+    **COUPLED_DIMS,
+    **dict.fromkeys(("x0_mean", "x0_sd"), ("robot",)),
     **PLACES,
 }
 """Last axes of the parameters, of which those that all robots share lack the first one."""
@@ -233,7 +251,8 @@ class Draws(Summary):
         if len(wanted["robot"]) < len(own["robot"]):
             return self._of_robots(order["robot"] or [], own).in_order(robots, features)
 
-        order |= {"effect": order["robot"], **dict.fromkeys(("move", "row", "col"))}
+        order |= dict.fromkeys(("robot_", "effect"), order["robot"])
+        order |= dict.fromkeys(("move", "row", "col"))
         arrays = dict(self.arrays)
         for name, value in self.arrays.items():
             axes = _AXES.get(name, ())[1 - value.ndim :] if value.ndim > 1 else ()

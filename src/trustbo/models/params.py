@@ -9,34 +9,15 @@ import xarray as xr
 
 from trustbo.arrays import Names, as_names, read_labelled, require_numbers
 from trustbo.errors import TrustboError, require_choice, require_switch, warn
-from trustbo.models.draws import PLACES, Draws
+from trustbo.models.draws import COUPLED_DIMS, PLACES, ROBOT_DIMS, Dims, Draws
 from trustbo.models.families import FAMILIES
 from trustbo.models.robots_in_bounds import RobotsInBounds
 
 Numbers = Any
 """A number or an array of numbers, which may have labels."""
 
-Dims = Mapping[str, tuple[str, ...]]
-"""Axes of each parameter after (draw,)."""
-
 POOLED_DIMS: Dims = {"beta0": (), "beta": ("feature",), "b": (), "delta_w": (), "delta_v": ()}
 """Parameters that all robots share, equations (3)-(4)."""
-ROBOT_DIMS: Dims = {
-    "beta0": ("robot",),
-    "beta": ("robot", "feature"),
-    "b": ("robot",),
-    "delta_w": ("robot",),
-    "delta_v": ("robot",),
-}
-"""Parameters of each robot, without influence on each other."""
-COUPLED_DIMS: Dims = {
-    "B0": ("robot", "robot_"),
-    "B": ("feature", "robot", "robot_"),
-    "b": ("robot",),
-    "Delta_w": ("robot", "robot_"),
-    "Delta_v": ("robot", "robot_"),
-}
-"""Parameters of the coupled model, equations (1)-(2)."""
 _NOT_COUPLED = ("delta_s", "f_v", "memory", "per_robot")
 """Further arguments that the coupled model does not have."""
 
