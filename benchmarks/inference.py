@@ -44,7 +44,7 @@ from common import Table, arguments, parsed
 
 import trustbo as tb
 from trustbo.inference import TrustFilter, importance, sample_prior
-from trustbo.inference.density import Density
+from trustbo.inference.class_target import ClassTarget
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.modes import at_modes
 from trustbo.inference.tree import parameters_alone
@@ -205,7 +205,7 @@ def hillside(n):
 def long_run(data):
     """Return means and standard deviations of the hyperparameters by name, from many points."""
     model = tb.models.default_model().for_features(data[0].features)
-    posterior = Density(model, model.observations(data))
+    posterior = ClassTarget(model, model.observations(data))
     origin = at_modes(posterior.log_density, posterior.start()[None])
     points = importance.sample(
         posterior.log_density, origin, np.random.default_rng(0), size=4096, enough=10_000.0,

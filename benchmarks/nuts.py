@@ -22,7 +22,7 @@ from inference import hillside
 
 import trustbo as tb
 from trustbo.inference import importance
-from trustbo.inference.density import Density
+from trustbo.inference.class_target import ClassTarget
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS
 from trustbo.inference.modes import at_modes
 
@@ -80,7 +80,7 @@ def scalars(draws):
 def difference(data, fits):
     """Compare the means of all fits with importance sampling; see the docstring of the script."""
     model = tb.models.default_model().for_features(data[0].features)
-    posterior = Density(model, model.observations(data))
+    posterior = ClassTarget(model, model.observations(data))
     rng = np.random.default_rng(0)
     origin = at_modes(posterior.log_density, posterior.start()[None])
     points = importance.sample(

@@ -22,8 +22,9 @@ from scipy import stats
 from tqdm import tqdm
 
 import trustbo as tb
+from trustbo.inference.class_target import ClassTarget
 from trustbo.inference.classes import OfClass, by_importance
-from trustbo.inference.density import Density, JointDraws
+from trustbo.inference.density import JointDraws
 from trustbo.inference.latent import replicate
 from trustbo.inference.variables import to_variables
 from trustbo.inference.weights import MAX_KHAT
@@ -91,7 +92,7 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
     model = model.for_features(missions[0].features)
     observations = model.observations(missions)
     before, measured, ranks = (
-        Density(model, observations),
+        ClassTarget(model, observations),
         ~np.isnan(observations.contact_rate),
         [],
     )
@@ -99,7 +100,7 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
         rng = np.random.default_rng([seed, j])
         truth = draw_prior(before, rng)
         rates = np.where(measured, replicate(OfClass(before, truth), rng)[0], np.nan)
-        posterior = Density(model, observations._replace(contact_rate=rates))
+        posterior = ClassTarget(model, observations._replace(contact_rate=rates))
         drawn, _, summary = by_importance(posterior, n_ranked, int(rng.integers(2**31)))
         if summary["k_hat"] <= MAX_KHAT:
             found, true = (numbers(to_variables(posterior, d)) for d in (drawn, truth))
@@ -110,7 +111,7 @@ def rank(model, missions, n, seed, n_ranked=N_RANKED):
 def draw_prior(density, rng):
     """Draw the hyperparameters and coefficients once from the prior."""
     theta = density.model.theta(density.scores.draw(1, rng), density.observations.resolution)
-    return JointDraws(theta, density.prior(theta).draw(rng))
+    return JointDraws(theta, density.columns.prior(theta).draw(rng))
 
 
 def numbers(groups):

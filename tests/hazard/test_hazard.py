@@ -58,9 +58,9 @@ def test_known_outcomes_have_the_beta_binomial_likelihood_of_scipy():
     failed = np.array([0, 1, 3, 0, 2, 0, 11])
     prior = law(rng.uniform(size=(7, 2)))
     points = sample(prior, trials(n, failed), rng)[0]
-    alpha, beta = prior.betas(points.z)
+    alpha, beta = prior.betas(points.x)
     binomial = stats.betabinom.logpmf(failed, n, alpha, beta) - np.log(special.comb(n, failed))
-    expected = binomial.sum(1) + stats.norm.logpdf(points.z).sum(1)
+    expected = binomial.sum(1) + stats.norm.logpdf(points.x).sum(1)
     np.testing.assert_allclose(points.log_p, expected, rtol=1e-8, atol=1e-8)
 
 
@@ -123,9 +123,9 @@ def test_posterior_means_equal_those_of_a_grid():
     log_p = stats.betabinom.logpmf(3, 8, alpha, beta) + stats.norm.logpdf(z).sum(1)
     weight = special.softmax(log_p)
     chance = weight @ ((alpha + 3.0) / (alpha + beta + 8.0))
-    alpha, beta = (part[:, 0] for part in of.betas(points.z))
+    alpha, beta = (part[:, 0] for part in of.betas(points.x))
     # Quasi-random points with an effective number of over 500.
-    np.testing.assert_allclose(points.weight @ points.z, weight @ z, atol=0.03)
+    np.testing.assert_allclose(points.weight @ points.x, weight @ z, atol=0.03)
     np.testing.assert_allclose(
         points.weight @ ((alpha + 3.0) / (alpha + beta + 8.0)), chance, atol=5e-3
     )
@@ -227,7 +227,7 @@ def test_the_posterior_of_the_margin_equals_quadrature_with_chances_integrated_o
         a, b = np.exp(0.3) * (1.0 - easy * flat) + 1e-12, np.exp(0.3) * easy * flat + 1e-12
         log_p += stats.betabinom.logpmf(failed[e], n[e], a, b)
     weight = special.softmax(log_p)
-    limit = law.values(points.z)[1]
+    limit = law.values(points.x)[1]
     for i, drawn in enumerate((margin, np.exp(log_width))):
         mean = (weight * drawn).sum()
         of_grid = np.sqrt((weight * drawn**2).sum() - mean**2)
@@ -246,7 +246,7 @@ def test_failures_teach_a_limit_that_is_four_degrees_too_high():
     n = np.full(12, 3)
     for failed, low, high in ((n * (degrees > 18.0), 3.0, 5.0), (0 * n, -1.5, 0.5)):
         points = sample(of, trials(n, failed), np.random.default_rng(0))[0]
-        assert low < points.weight @ of.values(points.z)[1][:, 0] < high
+        assert low < points.weight @ of.values(points.x)[1][:, 0] < high
         assert points.k_hat < 0.7
 
 
@@ -274,8 +274,8 @@ def test_the_hazard_is_calibrated():
         data = trials(n, failed, lost)
         points, places = sample(of, data, rng)
         assert points.k_hat < 0.7
-        chosen = rng.choice(len(points.z), n_ranks - 1, p=points.weight)
-        a, b = of.betas(points.z[chosen])
+        chosen = rng.choice(len(points.x), n_ranks - 1, p=points.weight)
+        a, b = of.betas(points.x[chosen])
         a, b = a + failed, b + n - failed
         for j, path in enumerate(lost):
             for k, e in enumerate(path):
@@ -283,7 +283,7 @@ def test_the_hazard_is_calibrated():
                 b[:, e] += places[chosen, j] > k
         chance = rng.beta(a, b)
         truth = np.array([*z[0], p[0], p[1], (1.0 - p).prod()])
-        drawn = np.column_stack([points.z[chosen], chance[:, :2], (1.0 - chance).prod(1)])
+        drawn = np.column_stack([points.x[chosen], chance[:, :2], (1.0 - chance).prod(1)])
         # Chances underflow to 0 in truth and draws alike: such ties are broken at random.
         ties = rng.integers((drawn == truth).sum(0) + 1)
         ranks.append((drawn < truth).sum(0) + ties)

@@ -14,8 +14,7 @@ from numpyro.infer import MCMC, NUTS
 from trustbo.data import Mission
 from trustbo.errors import TrustboError
 from trustbo.inference import add_latent, compare, fit, loo
-from trustbo.inference.functions.fit import log_likelihood_of_function
-from trustbo.inference.functions.known import as_model
+from trustbo.inference.learner import as_learner
 from trustbo.models import ContactRate, HierarchicalTrust, PooledTrust, Priors
 
 N_TICKS = 40
@@ -116,8 +115,9 @@ def test_missions_without_a_likelihood_and_later_with_one_are_left_out_alike(of_
 
 def test_densities_and_counts_are_not_compared(of_class, of_function, own):
     """They would differ by the sum of log n_ticks, 531 nats here, and not by the models."""
-    log_p, of_counts = log_likelihood_of_function(of_function, counted(), as_model(without_ticks))
-    assert not of_counts
+    source = as_learner(without_ticks).source(of_function, counted())
+    assert not source.of_counts
+    log_p = source.log_likelihood()
     log_p = of_function["log_likelihood"]["contact_rate"].copy(data=log_p[None])
     attrs = of_function.attrs | {"log_likelihood_of": "contact_rate"}
     densities = changed(of_function, log_p, **attrs)

@@ -9,7 +9,8 @@ from every_model import FEATURES, GRID, models_of, observed
 from numpyro import handlers
 
 from trustbo.inference import engine
-from trustbo.inference.density import Density, at
+from trustbo.inference.class_target import ClassTarget
+from trustbo.inference.density import at
 from trustbo.inference.nuts import in_jax
 from trustbo.models.backend import own_settings
 from trustbo.models.visited import visited
@@ -28,7 +29,7 @@ def posterior_of(model, *, change=None, **options):
     if change is not None:
         observations = change(observations)
 
-    posterior = Density(model, observations)
+    posterior = ClassTarget(model, observations)
     z = 0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores))
     return posterior, posterior.theta(z), lambda at: DenseRates(model, observations, at, bounds)
 
@@ -72,7 +73,7 @@ def posterior_on_maps(name):
     """As `posterior_of`, with missions on three maps; in the reference, these are far apart."""
     model = GAUSSIAN[name].for_features(FEATURES)
     observations, bounds = observed(gaps=True)
-    posterior = Density(model, observations._replace(visited=visited(bounds, GRID, MAPS)))
+    posterior = ClassTarget(model, observations._replace(visited=visited(bounds, GRID, MAPS)))
     z = 0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores))
 
     apart = bounds.copy()
@@ -107,7 +108,7 @@ def posterior_with_posts(name):
     posts = np.random.default_rng(2).integers(0, 3, bounds.shape[:2])
     bounds = bounds + 8 * np.where(bounds[..., :1] >= 0, posts[..., None], 0) * (1, 0, 0)
 
-    posterior = Density(model, observations._replace(visited=visited(bounds, GRID)))
+    posterior = ClassTarget(model, observations._replace(visited=visited(bounds, GRID)))
     z = 0.5 * np.random.default_rng(1).standard_normal((3, posterior.n_scores))
     return posterior, posterior.theta(z), lambda at: DenseRates(model, observations, at, bounds)
 

@@ -9,7 +9,7 @@ from dense_coefficients import DenseRates
 from dense_families import by_quadrature, of_one_report, with_one_limit
 from every_model import FEATURES, GRID, models_of
 
-from trustbo.inference.density import Density
+from trustbo.inference.class_target import ClassTarget
 from trustbo.models import HumanTrust, PooledTrust, Priors
 from trustbo.models.observations import Observations
 from trustbo.models.visited import visited
@@ -35,7 +35,7 @@ def small(name, family, y):
         FEATURES, visited(bounds, GRID),
     )  # fmt: skip
     model = models_of(family)[name].for_features(FEATURES)
-    posterior = Density(model, observations)
+    posterior = ClassTarget(model, observations)
     z = np.full((1, posterior.n_scores), -0.2)
     dense = DenseRates(model, observations, posterior.theta(z), bounds)
     moments = dense.mean[0], dense.cov[0], dense.noise[0]
@@ -94,12 +94,12 @@ def test_counts_far_below_their_prediction_keep_the_density_finite():
     model = PooledTrust(family="beta_binomial", priors=priors)
     rates = np.full((1, 1, 1), 0.8562)
     observations = Observations(rates, np.zeros((1, 1, 1, 1)), np.full((1, 1, 1), 146.0), ("a",))
-    posterior = Density(model, observations)
+    posterior = ClassTarget(model, observations)
 
     z = np.zeros((40, posterior.n_scores))
     z[:, posterior.scores.noises] = np.linspace(-2.5, 1.0, 40)[:, None]
     posterior.run_ep(posterior.theta(z[20:21]))
-    assert (posterior.near.lam < 1e-8).any()
+    assert (posterior.density.near.lam < 1e-8).any()
     ep_density = posterior.log_evidence(posterior.theta(z)) + posterior.scores.log_prior(z)
     np.testing.assert_allclose(posterior.log_density(z), ep_density, atol=0.4)
 
@@ -116,7 +116,7 @@ def people(scale, change=None):
 
     model = HumanTrust(scale=scale).for_features(OUTCOMES)
     observations = Observations(y, z, np.full(y.shape, 6.0), OUTCOMES)
-    posterior = Density(model, observations)
+    posterior = ClassTarget(model, observations)
     theta = posterior.theta(0.5 * rng.standard_normal((3, posterior.n_scores)))
     return posterior, theta, DenseRates(model, observations, theta)
 

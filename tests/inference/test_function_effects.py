@@ -10,12 +10,11 @@ from scipy import stats
 
 import trustbo as tb
 from trustbo.errors import TrustboError
-from trustbo.inference.functions.data import data_of
-from trustbo.inference.functions.effects import AddedEffects
+from trustbo.inference.functions.function import keys_of
 from trustbo.inference.functions.known import as_model
-from trustbo.inference.functions.sampling import keys_of, targets_of
+from trustbo.inference.functions.missions import FunctionData
+from trustbo.inference.functions.target import targets_of
 from trustbo.models import ContactRate, PlaceEffect, PooledTrust, RobotEffect, TrustParams
-from trustbo.models.observations import Observations
 from trustbo.models.priors import Priors
 
 FEATURES = ("traversability", "line_of_sight")
@@ -95,15 +94,13 @@ def missions(workspace):
 
 def target_of(function, missions):
     model = as_model(function)
-    observations = Observations.from_missions(missions)
-    data = data_of(missions, observations)
-    effects = AddedEffects(model.effects(data), observations, missions)
-    return targets_of(model, data, model.sites(data), effects)[0]
+    known = FunctionData(model, missions)
+    return targets_of(model, known.data, known.sites, known)[0]
 
 
 def dense_log_density(target, values):
     """Log density of all rates as one normal, whose means and covariances are summed in loops."""
-    effects = target.effects
+    effects = target.known.density.columns
     rates = effects.observations.contact_rate
     n_missions, n_bounds, n_robots = rates.shape
     theta = {name: np.atleast_1d(values[name]) for name in ("tau_slow", "tau_mission")}
@@ -160,8 +157,8 @@ def test_the_density_is_that_of_one_large_normal(function, missions):
     x = target.points(prior)
     found = target.log_density(x) - target.outer(x).log_p
 
-    n_missions, n_bounds, n_robots = target.effects.observations.contact_rate.shape
-    resolution = target.effects.observations.resolution
+    n_missions, n_bounds, n_robots = target.known.observations.contact_rate.shape
+    resolution = target.known.observations.resolution
     _, inputs = model.over_draws("space_and_inputs", 2, target.data)(prior, keys)
     for one in range(2):
         values = {name: v[one] for name, v in prior.items()}

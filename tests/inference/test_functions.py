@@ -25,7 +25,7 @@ from trustbo.inference import params_of
 from trustbo.inference.functions.data import data_of
 from trustbo.inference.functions.known import as_model, model_of_record
 from trustbo.inference.functions.sampling import _judge as judge
-from trustbo.inference.functions.sampling import targets_of
+from trustbo.inference.functions.target import targets_of
 from trustbo.inference.nuts import Samples
 from trustbo.inference.tree import parameters_alone
 from trustbo.models import ContactRate, PooledTrust, TrustParams

@@ -172,7 +172,7 @@ def test_a_mixture_draws_its_components_by_their_shares():
     x = mixture.draw(1024, np.random.default_rng(11))
 
     np.testing.assert_allclose(
-        np.histogram(x[:, 0], 3, (-4.5, 4.5))[0] / 1024, [0.5, 0.2, 0.3], atol=0.01
+        np.histogram(x[:, 0], 3, (-9.0, 9.0))[0] / 1024, [0.5, 0.2, 0.3], atol=0.01
     )
     other = stats.multivariate_t([0.0, 0.0], 16.0 * np.eye(2), df=8.0)
     z = other.rvs(60_000, random_state=1)

@@ -10,8 +10,8 @@ from missions import draw_rates
 from scipy import stats
 
 import trustbo as tb
+from trustbo.inference.class_target import ClassTarget
 from trustbo.inference.classes import by_importance
-from trustbo.inference.density import Density
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect, TrustParams
 
 FEATURES = ["line_of_sight", "slope"]
@@ -50,7 +50,7 @@ def with_equal_noise(model):
 def test_the_evidence_without_memory_is_that_of_quadrature():
     """Over both noises, half-normal a priori."""
     model = with_equal_noise(without_memory(PooledTrust()))
-    posterior = Density(model, model.observations(missions_with(0.3, 1)))
+    posterior = ClassTarget(model, model.observations(missions_with(0.3, 1)))
     found = by_importance(posterior, 1000, 0)[2]["log_evidence"]
 
     p = (np.arange(80) + 0.5) / 80

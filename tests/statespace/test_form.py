@@ -7,8 +7,9 @@ from scipy import stats
 from scipy.linalg import helmert
 from unit_noise import UnitNoise
 
-from trustbo.inference.functions.effects import layout_of
-from trustbo.inference.latent import Given, Source, draw_exactly
+from trustbo.inference.columns import Columns
+from trustbo.inference.density import Density, Outer
+from trustbo.inference.latent import Source, draw_exactly
 from trustbo.models.families import FAMILIES
 from trustbo.models.observations import Observations
 from trustbo.statespace import Inputs, kalman
@@ -169,19 +170,34 @@ def test_the_filter_has_the_density_and_the_trust_of_the_joint_normal(name, offs
             np.testing.assert_allclose(apart[point], np.nan_to_num(of_each), rtol=1e-9, atol=1e-11)
 
 
+class OfSpace(Source):
+    """Draws of a form with known inputs (bound, robot) of one mission."""
+
+    def __init__(self, space, drift, of_bounds, observations):
+        layout = Layout.of_space(space, observations.contact_rate)
+        density = Density(Columns((), observations), layout, FAMILIES["gaussian"])
+        super().__init__(density, len(space.transition))
+        inputs = (np.broadcast_to(v, (self.n_draws, 1, *v.shape)) for v in (drift, of_bounds))
+        self.whole = Outer(np.zeros(self.n_draws), space, Inputs(*inputs), {})
+
+    def outer(self, some):
+        return self.whole.take(some), np.zeros((len(some), 0))
+
+    def log_prior(self, given):
+        return {}
+
+    def prior(self, posterior, rng):
+        raise NotImplementedError
+
+
 def drawn_trust(space, drift, of_bounds, rates, rng):
     """Trust (point, bound, robot) of a mission given its rates, and their log-likelihood."""
     shape = (1, *rates.shape)
     observations = Observations(rates[None], np.zeros((*shape, 0)), np.full(shape, np.nan))
-    blocks = layout_of(space, rates[None])
-    source = Source(len(space.transition), observations, FAMILIES["gaussian"], *blocks)
-    layout = source.layout
-    predictor = LinearPredictor.from_space(space, layout)
-    u, o = (layout.rows(values[None, None]) for values in (drift, of_bounds))
-    mean = predictor.mean_given(u, source.label) + o
-    given = Given(np.arange(source.n_draws), predictor, mean)
+    source = OfSpace(space, drift, of_bounds, observations)
+    (given,) = source.given(np.arange(source.n_draws))
     trust, log_p = draw_exactly(source, given, rng)
-    return layout.unstack(trust)[:, 0], log_p[:, 0]
+    return source.layout.unstack(trust)[:, 0], log_p[:, 0]
 
 
 @pytest.mark.parametrize("point", range(N_POINTS))

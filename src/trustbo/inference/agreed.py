@@ -5,7 +5,8 @@ Therefore, each attempt samples twice, with different random numbers, and the tw
 in the means of all coordinates, and in the evidence, which is smaller if a part is missing.
 
 1. The first proposals are fitted at the modes that are reached from draws of the prior and, if
-   there is one, of the posterior of similar data.
+   there is one, of the posterior of similar data. Draws in modes that the points have not reached
+   are starts of a second sample.
 2. If such runs do not suffice or do not agree, the first proposals are those of a tempered search.
 3. If these do not agree either, the search is repeated once with more points.
 
@@ -28,7 +29,7 @@ import numpy as np
 from trustbo.inference.importance import Points, Rounds, Sampled, ratio, sample
 from trustbo.inference.mixture import MANY, Mixture, covariance_of
 from trustbo.inference.modes import LogDensity, at_modes
-from trustbo.inference.search import search
+from trustbo.inference.search import Visited, lost_modes, search
 from trustbo.inference.weights import MAX_KHAT, smoothed
 
 _N_RUNS = 2
@@ -50,10 +51,10 @@ _ENOUGH = 1000.0
 """Effective number of points of all charts of a run together at which it ends."""
 _LEAST = 500.0
 """The same below which a run has failed."""
+_N_SEEN = 384
+"""Largest number of draws of the starts whose density each run computes."""
 _N_STARTS = 3
-"""Number of points of each run from which modes are searched."""
-_GROUP = 64
-"""Each of them is that of the highest density among so many draws."""
+"""Number of groups of these draws; modes are searched from the best draw of each group."""
 _WIDE = 1.5
 """Scale of the wide proposal relative to the current one."""
 _WARY = 0.3
@@ -126,16 +127,35 @@ def _attempt(
 
 @np.errstate(all="ignore")  # coordinates that are far away overflow
 def _from_modes(charts: Sequence[Chart], rng: np.random.Generator) -> list[Sampled]:
-    """Sample in the only chart from the modes of the density."""
+    """Sample in the only chart from the modes of the density.
+
+    Points of the starts in modes that no point has reached are starts of a second sample.
+    """
     (chart,) = charts
-    d = chart.starts[0].shape[1]
+    x, log_p = _some_starts(chart, rng)
+    d = x.shape[1]
+    groups = np.array_split(np.arange(len(x)), _N_STARTS)
+    best = np.array([x[group[log_p[group].argmax()]] for group in groups])
+    found = _sample_from(chart, at_modes(chart.log_density, best), rng)
+    if d > MANY:
+        return [found]  # the points of a bent posterior would look like other modes
+
+    visited = Visited(x, log_p, found.points.log_evidence)
+    lost = lost_modes(visited, found.proposal, chart.log_density)
+    if len(lost):
+        origin = at_modes(chart.log_density, np.concatenate([best, lost]))
+        found = _sample_from(chart, origin, rng)
+    return [found]
+
+
+def _sample_from(chart: Chart, origin: Mixture, rng: np.random.Generator) -> Sampled:
+    """Sample with a first proposal that is fitted at modes."""
+    d = origin.center.shape[1]
     prior = Mixture.single(np.zeros(d), _PRIOR_SCALE * np.eye(d))
-    origin = at_modes(chart.log_density, _starts(chart, rng))
-    found = sample(
+    return sample(
         chart.log_density, origin, rng, defensive=_wider_and(prior), enough=_ENOUGH, most=_ROUNDS,
         wary=_WARY, size=_SIZE if d <= MANY else _SIZE_OF_MANY,
     )  # fmt: skip
-    return [found]
 
 
 def _wider_and(other: Mixture) -> Callable[[Mixture], Mixture]:
@@ -143,15 +163,13 @@ def _wider_and(other: Mixture) -> Callable[[Mixture], Mixture]:
     return lambda current: Mixture.joined([current.scaled(_WIDE), other], [0.5, 0.5])
 
 
-def _starts(chart: Chart, rng: np.random.Generator) -> np.ndarray:
-    """Return the best one (start, coordinate) of each of some groups of points."""
-    best = []
-    for k in range(_N_STARTS):
-        x = chart.starts[k % len(chart.starts)]
-        x = x[rng.choice(len(x), min(_GROUP, len(x)), replace=False)]
-        log_p = chart.log_density(x)
-        best.append(x[np.where(np.isfinite(log_p), log_p, -np.inf).argmax()])
-    return np.array(best)
+def _some_starts(chart: Chart, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (point, coordinate) of all starts in random order, and their log densities."""
+    n_each = _N_SEEN // len(chart.starts)
+    parts = [x[rng.choice(len(x), min(n_each, len(x)), replace=False)] for x in chart.starts]
+    x = rng.permutation(np.concatenate(parts))
+    log_p = chart.log_density(x)
+    return x, np.where(np.isfinite(log_p), log_p, -np.inf)
 
 
 def _from_search(charts: Sequence[Chart], rng: np.random.Generator, wanted: float) -> list[Sampled]:

@@ -1,7 +1,7 @@
 """Fits of model classes, and the trust, predictions and log prior of their draws."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -13,17 +13,14 @@ from trustbo.arrays import evenly_spaced
 from trustbo.data import Mission
 from trustbo.display import slow_bar
 from trustbo.inference import ep
-from trustbo.inference.density import Coefficients, Density, JointDraws, at
-from trustbo.inference.engine import inputs
+from trustbo.inference.class_target import ClassTarget
+from trustbo.inference.density import Coefficients, JointDraws, Outer, at
 from trustbo.inference.importance import ENOUGH, ROUNDS, SIZE, Points, Sampled, sample
 from trustbo.inference.latent import (
     N_PRIOR,
     N_TRAJECTORIES,
     Given,
     Source,
-    by_mission,
-    draw_exactly,
-    root_of,
 )
 from trustbo.inference.mixture import Mixture
 from trustbo.inference.modes import LogDensity, at_modes, climb, climb_on
@@ -37,7 +34,6 @@ from trustbo.models.model import TrustModel
 from trustbo.models.record import model_to_record
 from trustbo.models.scores import log_density
 from trustbo.stacking import require_same_robots
-from trustbo.statespace.blocks import each
 from trustbo.workspace import Workspace
 
 SAMPLERS = ("importance", "nuts")
@@ -55,10 +51,6 @@ _MISSED = np.log(1000.0)
 """Log ratio of the posterior to the points' proposal above which points miss a mode."""
 _MANY_SCORES = 13
 """Smallest number of scores for which a round has four times as many points."""
-_CHUNK = 32
-"""Number of draws evaluated at once."""
-_PARTICLES = 4
-"""Number of linear predictors drawn for each draw of the coefficients."""
 
 
 def require_poolable_with_model(
@@ -81,15 +73,15 @@ def fit_class(
 ) -> Fitted:
     """Fit a model class to missions."""
     model = model.for_features(missions[0].features)
-    density = Density(model, model.observations(missions, workspace))
+    target = ClassTarget(model, model.observations(missions, workspace))
     record = json.dumps(model_to_record(model))
     draws = options.draws or default_draws(model.effects, options.sampler)
     if options.sampler == "importance":
         first = _first_proposal(options.start, record)
         with slow_bar("fit", " points", options.progress) as bar:
-            density.evaluated = bar.update
+            target.evaluated = bar.update
             drawn, stats, summary = by_importance(
-                density, options.chains * draws, options.seed, first
+                target, options.chains * draws, options.seed, first
             )
 
         stats = {name: values[None] for name, values in stats.items()}  # in one chain
@@ -100,7 +92,7 @@ def fit_class(
             complaints.append(f"importance weights are uneven ({reason})")
     else:
         drawn, stats, summary, complaints = sample_by_nuts(
-            density,
+            target,
             chains=options.chains,
             draws=draws,
             warmup=options.warmup,
@@ -110,14 +102,14 @@ def fit_class(
         stats = by_chain(stats, options.chains)
         notes = {}
 
-    resolution = density.observations.resolution if model.likelihood.adds_noise else 0.0
+    resolution = target.observations.resolution if model.likelihood.adds_noise else 0.0
     return Fitted(
-        variables=to_variables(density, drawn),
-        prior=prior_parameters(density, N_PRIOR, np.random.default_rng([options.seed, 3])),
+        variables=to_variables(target, drawn),
+        prior=prior_parameters(target, N_PRIOR, np.random.default_rng([options.seed, 3])),
         dims=model.dims,
         labels={},
         effects=model.effects,
-        observations=density.observations,
+        observations=target.observations,
         statistics=stats,
         attrs={
             "model": type(model).__name__,
@@ -130,12 +122,12 @@ def fit_class(
         notes=notes,
         by_position=False,
         complaints=complaints,
-        source=lambda tree: OfClass(density, stored_draws(density, tree)),
+        source=lambda tree: OfClass(target, stored_draws(target, tree)),
     )
 
 
 def by_importance(
-    density: Density, n: int, seed: int, first: Mixture | None = None
+    target: ClassTarget, n: int, seed: int, first: Mixture | None = None
 ) -> tuple[JointDraws, dict[str, np.ndarray], dict[str, Any]]:
     """Take n draws by importance sampling; return the draws, statistics (draw,) and a summary.
 
@@ -145,17 +137,17 @@ def by_importance(
     Gaussian, EP is corrected at each point instead of drawing larger rounds.
     """
     rng = np.random.default_rng(seed)
-    last_size = _LAST_SIZE if density.is_gaussian else SIZE
+    last_size = _LAST_SIZE if target.is_gaussian else SIZE
     attempts = [(SIZE, None), (last_size, None)]
-    if first and _is_possible(density, first):
+    if first and _is_possible(target, first):
         attempts = [(SIZE, first), *attempts]
     while True:
         size, proposal = attempts.pop(0)
-        if density.n_scores >= _MANY_SCORES:
+        if target.n_scores >= _MANY_SCORES:
             size = 4 * size
 
         is_last = not attempts
-        found = _draws(density, n, size, rng, proposal, is_last)
+        found = _draws(target, n, size, rng, proposal, is_last)
         if found is None:
             continue
 
@@ -164,7 +156,7 @@ def by_importance(
             return drawn, {"lp": log_p}, summary
 
 
-def _is_possible(density: Density, first: Mixture) -> bool:
+def _is_possible(target: ClassTarget, first: Mixture) -> bool:
     """Return whether a first proposal is finite and has a positive density at its center.
 
     Unless rates are Gaussian, EP is run there; if the proposal is not possible, EP forgets it.
@@ -174,23 +166,23 @@ def _is_possible(density: Density, first: Mixture) -> bool:
             return False
 
         center = first.mean[None]
-        density.run_ep(density.theta(center))
-    if np.isfinite(density.log_density(center)[0]):
+        target.run_ep(target.theta(center))
+    if np.isfinite(target.log_density(center)[0]):
         return True
 
-    density.reset_ep()
+    target.density.reset_ep()
     return False
 
 
-def _is_elsewhere(density: Density, found: Sampled) -> bool:
+def _is_elsewhere(target: ClassTarget, found: Sampled) -> bool:
     """Return whether points whose first proposal was far away do not represent the posterior.
 
     They may be on the way to it, with too few effective points when the rounds end, or at a lower
     mode than the search for the mode finds. Unless rates are Gaussian, their density is that of EP
     near the first proposal, which is not accurate elsewhere.
     """
-    if not density.is_gaussian:
-        density.reset_ep()
+    if not target.is_gaussian:
+        target.density.reset_ep()
         return True
     points = found.points
     if points.k_hat > MAX_KHAT:
@@ -198,7 +190,7 @@ def _is_elsewhere(density: Density, found: Sampled) -> bool:
     if points.kish < ENOUGH:
         return True
 
-    return misses(found, density.log_density, climb(density.log_density, density.start()))
+    return misses(found, target.log_density, climb(target.log_density, target.start()))
 
 
 def misses(found: Sampled, log_density: LogDensity, mode: np.ndarray) -> bool:
@@ -209,7 +201,7 @@ def misses(found: Sampled, log_density: LogDensity, mode: np.ndarray) -> bool:
 
 @np.errstate(all="ignore")  # scores of points that are far away overflow
 def _draws(
-    density: Density,
+    target: ClassTarget,
     n: int,
     size: int,
     rng: np.random.Generator,
@@ -225,63 +217,63 @@ def _draws(
     fitted to the corrected density.
     """
     if first is None:
-        start = density.start()
+        start = target.start()
         if is_last:
-            start = climb_on(density.log_density, start)
-        origin = at_modes(density.log_density, start[None])
+            start = climb_on(target.log_density, start)
+        origin = at_modes(target.log_density, start[None])
     else:
         origin = first
 
-    at_once = is_last and not density.is_gaussian
+    at_once = is_last and not target.is_gaussian
     visited: list[Coefficients] = []
     corrected: list[np.ndarray] = []
 
     def visit(z: np.ndarray) -> np.ndarray:
-        sites = density.run_ep_at(z) if at_once else None
-        log_p, coefficients = density.visit(z, rng, sites)
+        sites = target.sites_at(z) if at_once else None
+        log_p, coefficients = target.visit(z, rng, sites)
         visited.append(coefficients)
         if not at_once:
             return log_p
 
         some = np.flatnonzero(np.isfinite(log_p))
-        correction, c = _correction(density, z, coefficients, some, rng, _CORRECTIONS, sites)
+        correction, c = _correction(target, z, coefficients, some, rng, _CORRECTIONS, sites)
         log_p[some] = correction
         corrected.append(c)
         return log_p
 
     found = sample(
-        density.log_density, origin, rng,
+        target.log_density, origin, rng,
         is_known=first is not None, size=size, most=_LAST_ROUNDS if is_last else ROUNDS,
-        defensive=density.defensive, visit=visit,
+        defensive=target.defensive, visit=visit,
     )  # fmt: skip
-    if first is not None and found.is_far and _is_elsewhere(density, found):
+    if first is not None and found.is_far and _is_elsewhere(target, found):
         return None
 
     points = found.points
     coefficients = Coefficients.joined(visited)
 
-    if density.is_gaussian:
+    if target.is_gaussian:
         chosen = points.resample(n, rng)
         c = coefficients.draw(chosen, rng)
     elif corrected:
         chosen = points.resample(n, rng)
         c = np.concatenate(corrected)[chosen]
     else:
-        points, c = _corrected(density, points, coefficients, rng)
+        points, c = _corrected(target, points, coefficients, rng)
         chosen = points.resample(n, rng)
         c = c[chosen]
 
     summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
-    drawn = JointDraws(density.theta(points.x[chosen]), c)
+    drawn = JointDraws(target.theta(points.x[chosen]), c)
     return drawn, points.log_p[chosen], summary | {"proposal": found.proposal.text}
 
 
 def _corrected(
-    density: Density, points: Points, coefficients: Coefficients, rng: np.random.Generator
+    target: ClassTarget, points: Points, coefficients: Coefficients, rng: np.random.Generator
 ) -> tuple[Points, np.ndarray]:
     """Draw coefficients (point, column) at all points, and correct the weights for errors of EP."""
     some = np.flatnonzero(points.weight * len(points.x) > _NEGLIGIBLE)
-    log_p, c = _correction(density, points.x, coefficients, some, rng)
+    log_p, c = _correction(target, points.x, coefficients, some, rng)
 
     log_ratio = points.log_ratio.copy()
     log_ratio[some] += log_p - points.log_p[some]
@@ -289,7 +281,7 @@ def _corrected(
 
 
 def _correction(
-    density: Density,
+    target: ClassTarget,
     z: np.ndarray,
     coefficients: Coefficients,
     some: np.ndarray,
@@ -299,14 +291,12 @@ def _correction(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the log density of `some` points (some,) with n draws of the coefficients of each.
 
-    The mean of the estimated densities is exact; see `Density.log_joint` for `sites`. Also return
+    The mean of the estimated densities is exact; see `ByEP.log_joint` for `sites`. Also return
     one of the draws at each point (point, column), chosen by its weight; at other points, any draw.
     """
     proposed = [coefficients.propose(np.arange(len(z)), rng) for _ in range(n)]
     here = sites and sites.of(some)
-    log_p = np.array(
-        [density.log_joint(z[some], c[some], rng, here) - q[some] for c, q in proposed]
-    )
+    log_p = np.array([target.log_joint(z[some], c[some], rng, here) - q[some] for c, q in proposed])
     c = proposed[0][0]
     if n > 1:
         largest = (log_p + rng.gumbel(size=log_p.shape)).argmax(0)  # with probabilities by weight
@@ -333,27 +323,16 @@ def _described(model: TrustModel) -> dict[str, Any]:
 class OfClass(Source):
     """Draws of a model class, with missions."""
 
-    def __init__(self, density: Density, draws: JointDraws, *, contrasts: bool = True) -> None:
-        """Arrange the rates in blocks.
-
-        Args:
-            density: Density of the model given the missions.
-            draws: Draws of hyperparameters and coefficients.
-            contrasts: Whether blocks may be contrasts of robots; see `TrustModel.layout`.
-        """
-        layout = density.layout
-        if not contrasts:
-            layout = density.model.layout(density.observations, contrasts=False)
-        likelihood = density.model.likelihood
-        super().__init__(len(draws.c), density.observations, likelihood, layout, layout.label)
-        self.density = density
+    def __init__(self, target: ClassTarget, draws: JointDraws, *, contrasts: bool = True) -> None:
+        """See `Source`; draws are those of hyperparameters and coefficients."""
+        super().__init__(target.density, len(draws.c), contrasts=contrasts)
+        self.target = target
         self.draws = draws
-        self._U = layout.design(density.columns.U)
 
     @property
     def first_equal(self) -> np.ndarray:
         """See `Source.first_equal`; draws of EP are resampled together with their coefficients."""
-        if self.density.is_gaussian:
+        if self.target.is_gaussian:
             return super().first_equal
 
         theta = [values.reshape(self.n_draws, -1) for values in self.draws.theta.values()]
@@ -361,82 +340,40 @@ class OfClass(Source):
         _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         return first[place.ravel()]
 
-    def given(self, some: np.ndarray) -> Iterator[Given]:
-        """See `Source.given`."""
-        for start in range(0, len(some), _CHUNK):
-            index = some[start : start + _CHUNK]
-            draws = self.draws.at(index)
-            model = self.density.model
-            predictor = model.linear_predictor(draws.theta, self.observations, self.layout)
+    def outer(self, some: np.ndarray) -> tuple[Outer, np.ndarray]:
+        """See `Source.outer`."""
+        draws = self.draws.at(some)
+        return self.target.outer_of(draws.theta), draws.c
 
-            u = inputs(self._U, len(self.label), draws.c)
-            yield Given(index, predictor, predictor.mean_given(u, self.label))
-
-    def draw(
-        self, given: Given, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """See `Source.draw`; unless rates are Gaussian, draws are weighted particles."""
-        draw = draw_exactly if self.density.is_gaussian else _draw_particles
-        x, log_p = draw(self, given, rng)
-        if self.of_counts:
-            log_p = log_p + self.shift
-        return x, log_p, at(self._log_prior, given.some)
+    def log_prior(self, given: Given) -> dict[str, np.ndarray]:
+        """See `Source.log_prior`."""
+        return at(self._log_prior, given.some)
 
     @cached_property
     def _log_prior(self) -> dict[str, np.ndarray]:
         """Log prior density (draw,) of each parameter, at all draws."""
-        return log_prior(self.density, to_variables(self.density, self.draws)["posterior"])
+        return log_prior(self.target, to_variables(self.target, self.draws)["posterior"])
 
     @cached_property
-    def sites(self) -> ep.Nearby:
+    def near(self) -> ep.Nearby:
         """EP sites near the mean of the draws, whatever was computed before."""
         self.density.reset_ep()
-        self.density.run_ep(self.draws.theta)
-        return self.density.near
+        self.target.run_ep(self.draws.theta)
+        return self.target.density.near
 
     def prior(self, posterior: xr.DataTree, rng: np.random.Generator) -> "OfClass":
         """See `Source.prior`."""
         if "prior" in posterior.children:
             parameters = parameters_of(posterior, group="prior")
         else:  # the user has dropped it
-            parameters = prior_parameters(self.density, N_PRIOR, rng)
+            parameters = prior_parameters(self.target, N_PRIOR, rng)
 
         n_draws = len(next(iter(parameters.values())))
         some = at(parameters, evenly_spaced(n_draws, N_TRAJECTORIES))
-        return OfClass(self.density, with_prior_effects(self.density, some, rng))
+        return OfClass(self.target, with_prior_effects(self.target, some, rng))
 
 
-def _draw_particles(
-    source: OfClass, given: Given, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw trust given non-Gaussian rates by weighted particles; see `latent.draw_exactly`."""
-    density = source.density
-    predictor = given.predictor
-    mean = given.mean
-    joint = ep.Joint(
-        density.blocks, predictor, density.prior(at(source.draws.theta, given.some)), density.rates
-    )
-    sites, _ = source.sites.at(density.rates, predictor.noise_sd)
-
-    # Draw particles of the predictor f; for each block, Gumbel noise chooses one by weight.
-    drawn = [ep.draw_predictors(joint, mean, sites, rng) for _ in range(_PARTICLES)]
-    f, log_w = (np.stack(part) for part in zip(*drawn, strict=True))
-    chosen = np.argmax(log_w + rng.gumbel(size=log_w.shape), axis=0)
-    f = np.take_along_axis(f, chosen[None, ..., None], axis=0)[0]
-    log_p = by_mission(logsumexp(log_w, axis=0) - np.log(_PARTICLES), source)
-
-    if predictor.shared_cov is None:  # the predictor is trust
-        return f, log_p
-
-    # Trust given the predictor f = trust + shared noise.
-    V = each(predictor.covariance, source.label)
-    S = each(predictor.trust_cov, source.label)
-    gain = np.swapaxes(np.linalg.solve(V, S), 2, 3)
-    x = mean + (gain @ (f - mean)[..., None])[..., 0]
-    return x + (root_of(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p
-
-
-def log_prior(fitted: Density, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def log_prior(fitted: ClassTarget, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Compute the log prior density (draw,) of each parameter with an independent prior.
 
     Deviations of robots from a common mean belong to the model and not to the prior, so only means
@@ -445,7 +382,7 @@ def log_prior(fitted: Density, parameters: Mapping[str, np.ndarray]) -> dict[str
     on `delta_v` does not include the noise that is due to the resolution of the rates.
 
     Args:
-        fitted: Density of the model given missions.
+        fitted: ClassTarget of the model given missions.
         parameters: Draws (draw, ...) of the parameters by name.
     """
     model = fitted.model

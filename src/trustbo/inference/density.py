@@ -1,59 +1,82 @@
-"""The posterior density of a model for samplers, and draws of coefficients."""
+"""The density of rates given a model's form, with the coefficients of its effects integrated out.
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+A model says at a point what its `Outer` contains: its log prior, its form, its inputs and the
+hyperparameters of its effects. Model classes say so in NumPy (`class_target`), and NumPyro
+functions in JAX (`functions.target`). All that follows is the same for both, and is done here.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy import special
 
-from trustbo.inference import ep
 from trustbo.inference.columns import Columns
-from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, evidence, expected
-from trustbo.inference.mixture import Mixture
-from trustbo.inference.modes import climb
+from trustbo.inference.engine import Blocks, Fit, Prior, coefficients_of, evidence
 from trustbo.models.effects.effect import Theta
-from trustbo.models.model import TrustModel
-from trustbo.models.observations import Observations
-from trustbo.statespace.blocks import LinearPredictor, rate_precision
+from trustbo.models.families import Family
+from trustbo.statespace import Inputs, StateSpace
+from trustbo.statespace.blocks import Layout, LinearPredictor, each, rate_precision
 
-_CHUNK = 32
+CHUNK = 32
 """Largest number of points evaluated at once."""
 _LEAST_CHUNK = 8
 """Smallest number of points evaluated at once, for which vector instructions still pay."""
 _NUMBERS = 12_000_000
 """Largest number of precision entries of the points evaluated at once."""
-_FEW = 15
-"""Number of missions with which the search for the mode begins."""
-_SIZES = (0.3, 1.0, 1.8, 2.6)
-"""Log ratios of the sd of rates to the noises at each start of the search."""
-_USUAL_NOISE = 0.2
-"""Scale of the default priors of the noises, to which the sd of rates is compared."""
-_SPREADS = (1e-2, 3.0)
-"""Limits of the ratio of the sd of rates to the usual noise."""
-_LARGEST_NOISE = 50.0
-"""Largest size of the noises whose density is computed; see `NormalScores`."""
-_LEAST_NOISE = 1e-6
-"""Smallest size of the noises whose density is computed."""
-_SWEEPS = 1
-"""Number of EP sweeps at each point for an evidence, beginning with the sites at the mode."""
-_LAST_SWEEPS = 2
-"""The same, for coefficients where those of the sites at the mode give uneven weights."""
-_SETTLED = 12
-"""Largest number of EP sweeps that find the sites at the mode."""
-_STEADY = 1e-3
-"""Relative change of the sites in a sweep below which the sweeps end."""
-_DAMPING = 0.7
-"""Damping of the EP sweeps that find the sites at the mode."""
+_LEAST_NOISE = 1e-8
+"""Smallest standard deviation of a rate's own noise with which the density is computed."""
 _DEVIATIONS = 4
 """Number of draws of the coefficients that are kept at each visited point."""
 _LEAST_DEGREES = 8.0
 """Smallest number of degrees of freedom of a proposal of coefficients."""
 _SQUARED = 3.0
 """Squared number of columns per degree of freedom of a proposal of coefficients."""
-_WIDER = 1.5
-"""Factor on the covariance of the core scores in the defensive proposal."""
-_PRIOR_VARIANCE = 1.2
-"""Variance of the other scores in the defensive proposal; a priori, it is 1."""
+
+
+class Outer(NamedTuple):
+    """What a model says at points, of which the first axis of all arrays is (point,)."""
+
+    log_p: Any
+    """Log density (point,) of all but the rates and coefficients; -inf where impossible."""
+    space: StateSpace
+    """The form."""
+    inputs: Inputs
+    """Known inputs (point, mission, bound, robot or 1), to which effects are added; or numbers."""
+    theta: Theta
+    """Hyperparameters of the effects, by name."""
+    random: Inputs | None = None
+    """Inputs of random effects of single missions; see `TrustModel.random_effects`."""
+    log_prior: Mapping[str, Any] = {}
+    """Log prior density (point, ...) of each variable by name, where it is known."""
+
+    def take(self, index: Any) -> Self:
+        """Select points by an index array, a mask or a slice."""
+
+        def of(inputs: Inputs) -> Inputs:
+            return Inputs(*(value[index] if np.ndim(value) else value for value in inputs))
+
+        return type(self)(
+            self.log_p[index],
+            self.space.take(index),
+            of(self.inputs),
+            at(self.theta, index),
+            None if self.random is None else of(self.random),
+            at(self.log_prior, index),
+        )
+
+    @property
+    def is_possible(self) -> np.ndarray:
+        """Whether the density of the rates may be positive, shape (point,)."""
+        n = len(self.log_p)
+        values = [*self.space, *self.inputs, *self.theta.values(), self.log_p]
+        flat = [v.reshape(n, -1) for v in values if v is not None and np.ndim(v)]
+        noise = self.space.noise_sd.reshape(n, -1).min(1)
+        if np.ndim(self.inputs.noise):
+            noise = noise * self.inputs.noise.reshape(n, -1).min(1)
+
+        possible = np.isfinite(np.concatenate(flat, axis=1)).all(1) & (noise > _LEAST_NOISE)
+        return possible & (self.theta["inverse_gain"].reshape(n, -1) != 0.0).all(1)
 
 
 class JointDraws(NamedTuple):
@@ -128,264 +151,124 @@ class Coefficients(NamedTuple):
 
 
 class Density:
-    """Posterior density of a model's scores, and draws of its coefficients given the scores."""
+    """Density of Gaussian rates at points, and draws of the coefficients given the rates.
 
-    def __init__(self, model: TrustModel, observations: Observations) -> None:
-        """Prepare the design matrix and blocks of a model for the observations."""
-        self.model = model
-        self.observations = observations
-        self.evaluated: Callable[[int], object] = lambda n: None  # called with the number of points
-        self.layout = model.layout(observations)
-        self.scores = model.scores(observations)
-        self.n_scores = self.scores.n_scores
+    Attributes:
+        columns: Effects, with the rates and awareness of the missions.
+        observations: These rates and awareness.
+        layout: Layout of the rates in blocks.
+        likelihood: Observation family.
+        U: Design of all blocks, a sparse matrix (block * input, column).
+        blocks: Data of all blocks, from the first point on that is evaluated. Which columns depend
+            on each other a priori, and which blocks have equal noise, is the same at all points.
+    """
 
-        self.columns = Columns(model.terms, observations)
-        self.prior = self.columns.prior
-        self.is_gaussian = model.likelihood.gaussian
+    is_gaussian = True
 
-        # Which columns depend on each other a priori, and which blocks have equal noise, does not
-        # depend on theta, so any will do.
-        y = self.layout.rows(observations.contact_rate)
-        predictor, prior = self._at(self.theta(np.zeros((1, self.n_scores))))
-        U = self.layout.design(self.columns.U)
+    blocks: Blocks
+
+    def __init__(self, columns: Columns, layout: Layout, likelihood: Family) -> None:
+        self.columns = columns
+        self.observations = columns.observations
+        self.layout = layout
+        self.likelihood = likelihood
+        self.U = layout.design(columns.U)
+
+    def prepare(self, outer: Outer) -> None:
+        """Arrange rates and columns in blocks, given what the model says at any points."""
+        predictor, prior = self.given(outer.take(slice(1)))
         self.blocks = Blocks.from_rows(
-            y, U, self.layout.label, predictor.noise_sd[0], prior=prior, apart=not self.is_gaussian
-        )
-        if not self.is_gaussian:
-            self.rates = ep.Rates(model.likelihood, y, self.layout.rows(observations.n_ticks))
-            self.reset_ep()
+            self.layout.rows(self.observations.contact_rate), self.U, self.layout.label,
+            predictor.noise_sd[0], prior=prior, apart=not self.is_gaussian,
+        )  # fmt: skip
 
-    @property
-    def _n_at_once(self) -> int:
-        """Number of points evaluated at once, which limits the memory for their matrices."""
-        return int(np.clip(_NUMBERS // self.blocks.order.size, _LEAST_CHUNK, _CHUNK))
+    def chunks(self, outer: Outer) -> Iterator[tuple[np.ndarray, Outer]]:
+        """Yield the possible points in chunks, which limits the memory for their matrices."""
+        some = np.flatnonzero(outer.is_possible)
+        if not len(some):
+            return
+        if not hasattr(self, "blocks"):
+            self.prepare(outer.take(some[:1]))
 
-    def without(self, mission: int) -> "Density":
-        """Return the density without the data of one mission."""
-        other = Density(self.model, self.observations.without([mission]))
-        if not self.is_gaussian:
-            kept = ~np.isnan(other.rates.y)
-            other.sites = ep.Sites(*(np.where(kept, site, 0.0) for site in self.sites))
-        return other
+        size = int(np.clip(_NUMBERS // self.blocks.order.size, _LEAST_CHUNK, CHUNK))
+        for start in range(0, len(some), size):
+            index = some[start : start + size]
+            yield index, outer.take(index)
 
-    def theta(self, z: np.ndarray) -> dict[str, Any]:
-        """Convert scores (point, score) to hyperparameters for the model's `linear_predictor`."""
-        return self.model.theta(self.scores.values(z), self.observations.resolution)
-
-    def log_density(self, z: np.ndarray) -> np.ndarray:
-        """Compute the unnormalised log posterior density (point,) of scores (point, score).
-
-        Unless rates are Gaussian, the density is that of EP near the theta of `run_ep`, in the
-        approximation of `ep.nearby`.
-        """
-        log_p = np.full(len(z), -np.inf)
-        with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
-            theta, log_prior, some = self.possible(z)
-            for where, chunk in chunks(theta, self._n_at_once):
-                fit, _ = self._fit(chunk)
-                log_p[some[where]] = fit.log_p
-            log_p[some] += log_prior
+    def log_density(self, outer: Outer) -> np.ndarray:
+        """Compute the log joint density (point,) of points and rates, up to a constant."""
+        log_p = np.full(len(outer.log_p), -np.inf)
+        with np.errstate(all="ignore"):  # extreme values overflow and get zero density
+            for index, part in self.chunks(outer):
+                log_p[index] = self.fitted(part)[0].log_p + part.log_p
         return np.where(np.isfinite(log_p), log_p, -np.inf)
 
     def visit(
-        self, z: np.ndarray, rng: np.random.Generator, sites: ep.Sites | None = None
+        self, outer: Outer, rng: np.random.Generator, **options: Any
     ) -> tuple[np.ndarray, Coefficients]:
-        """Compute the log density of `log_density` and the coefficients at each point.
+        """Compute `log_density`, and the coefficients at each point.
 
-        With the sites of `run_ep_at`, the coefficients are closer to the posterior; the log density
-        is then that of rates equal to the sites.
+        `options` are those of `fitted`, with the axis (point,).
         """
-        log_p = np.full(len(z), -np.inf)
-        found = Coefficients.empty(len(z), self.columns.n)
-
-        with np.errstate(all="ignore"):  # extreme scores overflow and get zero density
-            theta, log_prior, some = self.possible(z)
-            for where, chunk in chunks(theta, self._n_at_once):
-                fit, prior = self._fit(chunk, sites and sites.of(some[where]))
-                log_p[some[where]] = fit.log_p
+        log_p = np.full(len(outer.log_p), -np.inf)
+        found = Coefficients.empty(len(log_p), self.columns.n)
+        with np.errstate(all="ignore"):  # extreme values overflow and get zero density
+            for index, part in self.chunks(outer):
+                own = {name: value.of(index) for name, value in options.items()}
+                fit, prior = self.fitted(part, **own)
+                log_p[index] = fit.log_p + part.log_p
                 parts = coefficients_of(prior, fit, _DEVIATIONS, rng)
-                for values, part in zip(found, (*parts, fit.F.log_det), strict=True):
-                    values[some[where]] = part
-            log_p[some] += log_prior
-
+                for values, one in zip(found, (*parts, fit.F.log_det), strict=True):
+                    values[index] = one
         return np.where(np.isfinite(log_p), log_p, -np.inf), found
 
-    def possible(self, z: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
-        """Return hyperparameters, log priors and indices where the density may be positive."""
-        theta = self.theta(z)
-        log_prior = self.scores.log_prior(z)
-        size = np.exp(z[:, self.scores.noises])
-        flat = [np.asarray(values).reshape(len(z), -1) for values in theta.values()]
-
-        possible = np.isfinite(np.column_stack([*flat, log_prior])).all(1)
-        possible &= ((size > _LEAST_NOISE) & (size < _LARGEST_NOISE)).all(1)
-        possible &= (theta["inverse_gain"].reshape(len(z), -1) != 0.0).all(1)
-
-        some = np.flatnonzero(possible)
-        return at(theta, some), log_prior[some], some
-
-    def log_evidence(self, theta: Theta) -> np.ndarray:
-        """Compute log p(rates | theta) at each point, with EP if rates are not Gaussian."""
-        log_p = np.empty(len(theta["inverse_gain"]))
-        for where, chunk in chunks(theta, self._n_at_once):
-            if self.is_gaussian:
-                fit, _ = self._fit(chunk)
-                log_p[where] = fit.log_p
-            else:
-                joint = self._joint(chunk)
-                sites = ep.swept(joint, self.sites, _SWEEPS)
-                log_p[where] = ep.log_evidence(joint, sites)
+    def log_evidence(self, outer: Outer) -> np.ndarray:
+        """Compute log p(rates | point), shape (point,)."""
+        log_p = np.full(len(outer.log_p), -np.inf)
+        for index, part in self.chunks(outer):
+            log_p[index] = self.fitted(part)[0].log_p
         return log_p
+
+    def draw_coefficients(self, outer: Outer, rng: np.random.Generator) -> np.ndarray:
+        """Draw the coefficients (point, column) once at each point, given Gaussian rates."""
+        drawn = np.empty((len(outer.log_p), self.columns.n))
+        for index, part in self.chunks(outer):
+            fit, prior = self.fitted(part)
+            mean, deviation, _ = coefficients_of(prior, fit, 1, rng)
+            drawn[index] = mean + deviation[:, 0]
+        return drawn
+
+    def given(self, outer: Outer) -> tuple[LinearPredictor, Prior]:
+        """Return the distribution of the linear predictors and the prior at each point."""
+        return self.predictor(outer), self.columns.prior(outer.theta)
+
+    def predictor(self, outer: Outer, layout: Layout | None = None) -> LinearPredictor:
+        """Return the distribution of the linear predictors at each point, without known inputs."""
+        layout = self.layout if layout is None else layout
+        return LinearPredictor.from_space(outer.space, layout, outer.random, outer.inputs.noise)
+
+    def fitted(self, outer: Outer) -> tuple[Fit, Prior]:
+        """Compute the evidence at each point; also return the prior.
+
+        Here, the noise of a measured rate enters: its sd is `delta_v`, to which the resolution of
+        the rate was added, times the scale of the noise.
+        """
+        predictor, prior = self.given(outer)
+        blocks = self.blocks
+        precision = rate_precision(blocks.seen, predictor.noise_sd, blocks.first)
+
+        y = None
+        if np.ndim(outer.inputs.drift):  # its mean contribution is taken off the rates
+            u = self.layout.rows(outer.inputs.drift)
+            response = each(predictor.response, self.layout.label)
+            y = blocks.y - (response @ u[..., None])[..., 0]
+        return evidence(blocks, predictor, prior, precision, y), prior
+
+    def run_ep(self, outer: Outer) -> None:
+        """Do nothing, as Gaussian rates need no EP; see `ByEP`."""
 
     def reset_ep(self) -> None:
-        """Forget the EP sites, so that results do not depend on earlier computations."""
-        if not self.is_gaussian:
-            self.sites = ep.first_sites(self.rates)
-
-    def run_ep(self, theta: Theta) -> None:
-        """Find the EP sites at the mean of theta, which determine those at other points."""
-        if not self.is_gaussian:
-            center = {name: values.mean(0, keepdims=True) for name, values in theta.items()}
-            joint = self._joint(center)
-            for _ in range(_SETTLED):
-                before = self.sites
-                self.sites = ep.swept(joint, before, 1, _DAMPING)
-                if self.sites.close_to(before, _STEADY):
-                    break
-            self.near = ep.Nearby.from_sites(joint, self.sites)
-
-    def run_ep_at(self, z: np.ndarray) -> ep.Sites:
-        """Find the EP sites at each point (point, score); they are 0 where the density is 0."""
-        shape = (len(z), *self.rates.y.shape)
-        found = ep.Sites(np.zeros(shape), np.zeros(shape))
-        with np.errstate(all="ignore"):  # as in `log_density`
-            theta, _, some = self.possible(z)
-            for where, chunk in chunks(theta, self._n_at_once):
-                sites = ep.swept(self._joint(chunk), self.sites, _LAST_SWEEPS)
-                for values, part in zip(found, sites, strict=True):
-                    values[some[where]] = part
-        return found
-
-    def start(self) -> np.ndarray:
-        """Return a starting point for the search for the mode or, with EP, the mode itself.
-
-        With many missions, the starting point is the mode given the first few missions, for which
-        the density is cheaper to compute.
-        """
-        few = self.observations.first(_FEW)
-        if self.observations.n_missions >= 2 * _FEW and not np.isnan(few.contact_rate).all():
-            of_few = Density(self.model, few)
-            best = climb(of_few.log_density, of_few.start())
-        else:
-            best = self._best_of_four_starts()
-
-        if not self.is_gaussian:
-            # The approximate density is most accurate near the theta of `run_ep`.
-            self.run_ep(self.theta(best[None]))
-            best = climb(self.log_density, best)
-            self.run_ep(self.theta(best[None]))
-        return best
-
-    def _best_of_four_starts(self) -> np.ndarray:
-        """Return the best of four points, at which the noises have different sizes."""
-        starts = np.zeros((len(_SIZES), self.n_scores))
-        unit = self.model.likelihood.line_of_sight[0]
-        ratio = unit * np.nanstd(self.observations.contact_rate) / _USUAL_NOISE
-        spread = np.log(np.clip(ratio, *_SPREADS))
-        starts[:, self.scores.noises] = spread - np.array(_SIZES)[:, None]
-
-        self.run_ep(self.theta(starts[1:2]))  # the sites of the second start suit all four
-        return starts[self.log_density(starts).argmax()]
-
-    def defensive(self, proposal: Mixture) -> Mixture:
-        """Widen a proposal for beta0, noises and sizes; keep other scores near the prior."""
-        core = self.scores.core
-        others = np.setdiff1d(np.arange(self.n_scores), core)
-
-        center = proposal.mean
-        center[others] = 0.0
-
-        cov = _WIDER * proposal.total
-        cov[others] = 0.0
-        cov[:, others] = 0.0
-        cov[others, others] = _PRIOR_VARIANCE
-        return Mixture.single(center, np.linalg.cholesky(cov))
-
-    def log_joint(
-        self,
-        z: np.ndarray,
-        c: np.ndarray,
-        rng: np.random.Generator,
-        sites: ep.Sites | None = None,
-    ) -> np.ndarray:
-        """Estimate the log joint density (draw,) of scores, coefficients and rates.
-
-        The linear predictors are drawn and weighted, so that the mean of the estimated densities is
-        exact.
-
-        Args:
-            z: Normal scores (draw, score).
-            c: Coefficients (draw, column).
-            rng: Random number generator.
-            sites: EP sites at each draw, by default those near the theta of `run_ep`. The better
-                they are, the more even are the weights.
-        """
-        theta = self.theta(z)
-        log_p = self.scores.log_prior(z)
-        for where, chunk in chunks(theta):
-            joint = self._joint(chunk)
-            at = expected(self.blocks, joint.predictor, c[where])
-            if sites is None:
-                here, _ = self.near.at(self.rates, joint.predictor.noise_sd)
-            else:
-                here = sites.of(where)
-            _, log_block = ep.draw_predictors(joint, at, here, rng)
-            log_p[where] += joint.prior.log_density(c[where]) + log_block.sum(1)
-        return log_p
-
-    def draw_coefficients(self, theta: Theta, rng: np.random.Generator) -> np.ndarray:
-        """Draw the coefficients (point, column) once at each point, given Gaussian rates."""
-        drawn = []
-        for _, chunk in chunks(theta):
-            fit, prior = self._fit(chunk)
-            mean, deviation, _ = coefficients_of(prior, fit, 1, rng)
-            drawn.append(mean + deviation[:, 0])
-        return np.concatenate(drawn)
-
-    def _fit(self, theta: Theta, sites: ep.Sites | None = None) -> tuple[Fit, Prior]:
-        """Compute the evidence at each theta, as in `visit`; also return the prior."""
-        if not self.is_gaussian:
-            joint = self._joint(theta)
-            if sites is None:
-                fit = ep.nearby(joint, self.near)
-            else:
-                fit = evidence(self.blocks, joint.predictor, joint.prior, sites.lam, sites.y)
-            return fit, joint.prior
-
-        predictor, prior = self.given(theta)
-        return evidence(self.blocks, predictor, prior, self.rate_precision(predictor)), prior
-
-    def given(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
-        """Return the distribution of the linear predictors and the prior at each theta."""
-        self.evaluated(len(theta["inverse_gain"]))
-        return self._at(theta)
-
-    def _at(self, theta: Theta) -> tuple[LinearPredictor, Prior]:
-        """See `given`."""
-        predictor = self.model.linear_predictor(theta, self.observations, self.layout)
-        return predictor, self.prior(theta)
-
-    def rate_precision(self, predictor: LinearPredictor) -> Any:
-        """Return the precisions (point, kind, row) of Gaussian rates, 0 where not measured.
-
-        Here, the noise of a measured rate enters: its sd is `delta_v`, to which `TrustModel.theta`
-        adds the resolution of the rate, times `TrustModel.noise_scale`.
-        """
-        return rate_precision(self.blocks.seen, predictor.noise_sd, self.blocks.first)
-
-    def _joint(self, theta: Theta) -> ep.Joint:
-        """Return the blocks, linear predictors, prior and observations for EP at each theta."""
-        return ep.Joint(self.blocks, *self.given(theta), self.rates)
+        """Do nothing; see `run_ep`."""
 
 
 def at(theta: Mapping[str, Any], index: Any) -> dict[str, Any]:
@@ -393,7 +276,7 @@ def at(theta: Mapping[str, Any], index: Any) -> dict[str, Any]:
     return {name: values[index] for name, values in theta.items()}
 
 
-def chunks(theta: Mapping[str, Any], size: int = _CHUNK) -> Iterator[tuple[slice, dict[str, Any]]]:
+def chunks(theta: Mapping[str, Any], size: int = CHUNK) -> Iterator[tuple[slice, dict[str, Any]]]:
     """Yield the slice and the hyperparameters of each chunk of points."""
     for start in range(0, len(theta["inverse_gain"]), size):
         where = slice(start, start + size)

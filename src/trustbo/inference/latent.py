@@ -1,38 +1,42 @@
 """Latent trust, likelihoods and predicted contact rates given draws of the parameters."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy.special import logsumexp
 from tqdm import tqdm
 
-from trustbo.inference.engine import kinds_of, whiten
+from trustbo.inference import ep
+from trustbo.inference.density import CHUNK, Density, Outer
+from trustbo.inference.engine import inputs, kinds_of, whiten
 from trustbo.inference.factor import cholesky
-from trustbo.models.families import Family
-from trustbo.models.observations import Observations
-from trustbo.statespace.blocks import Layout, LinearPredictor, each, rate_precision
+from trustbo.statespace.blocks import LinearPredictor, each, rate_precision
 
 N_PRIOR = 500
 """Number of draws in the group `prior`."""
 N_TRAJECTORIES = 200
 """Number of kept draws of latent trust and predicted rates, evenly spaced in the chains."""
+_PARTICLES = 4
+"""Number of linear predictors drawn for each draw of the coefficients."""
 
 
 class Given(NamedTuple):
     """Linear predictors of all blocks at some draws, given the parameters and effects."""
 
     some: np.ndarray  # indices of the draws
+    outer: Outer
     predictor: LinearPredictor
     mean: np.ndarray  # of the linear predictors, (draw, block, row)
-    log_likelihood: Any = None  # (draw, mission), where it is known
-    log_prior: Any = None  # (draw,) of each variable by name, where it is known
 
 
-class Source:
+class Source(ABC):
     """Draws of the parameters and effects of a model, with missions.
 
     Attributes:
+        density: Density of the rates of the missions.
         n_draws: Number of draws.
         observations: Rates and awareness of the missions.
         likelihood: Observation family.
@@ -42,49 +46,80 @@ class Source:
             where ticks are unknown.
     """
 
-    def __init__(
-        self,
-        n_draws: int,
-        observations: Observations,
-        likelihood: Family,
-        layout: Layout,
-        label: np.ndarray,
-    ) -> None:
-        self.n_draws = n_draws
-        self.observations = observations
-        self.likelihood = likelihood
-        self.layout = layout
-        self.label = label
-        y = observations.contact_rate
-        self.shift = likelihood.log_resolution(y, observations.n_ticks).sum((1, 2))
+    size: ClassVar[int] = CHUNK
+    """Number of draws that are evaluated at once."""
 
-    @property
-    def of_counts(self) -> bool:
-        """Whether log-likelihoods are those of tick counts, comparable between families."""
-        return not np.isnan(self.shift).any()
+    def __init__(self, density: Density, n_draws: int, *, contrasts: bool = True) -> None:
+        """Arrange the rates in blocks, which may be contrasts of robots if `contrasts`."""
+        self.density = density
+        self.n_draws = n_draws
+        self.observations = density.observations
+        self.likelihood = density.likelihood
+        self.layout = density.layout
+        self._U = density.U
+        if not contrasts and self.layout.rotation is not None:
+            self.layout = self.layout._replace(joint=True, rotation=None)
+            self._U = self.layout.design(density.columns.U)
+        self.label = self.layout.label
+        y = self.observations.contact_rate
+        self.shift = self.likelihood.log_resolution(y, self.observations.n_ticks).sum((1, 2))
+
+    # --- what classes and functions say differently ---
+
+    @abstractmethod
+    def outer(self, some: np.ndarray) -> tuple[Outer, np.ndarray]:
+        """Return what the model says at some draws, and their coefficients (draw, column)."""
+
+    @abstractmethod
+    def log_prior(self, given: Given) -> dict[str, np.ndarray]:
+        """Return the log prior density (draw,) of each parameter by name."""
+
+    @abstractmethod
+    def prior(self, posterior: xr.DataTree, rng: np.random.Generator) -> "Source":
+        """Return `N_TRAJECTORIES` draws from the prior, evenly spaced in the group `prior`."""
 
     @property
     def first_equal(self) -> np.ndarray:
         """Index (draw,) of the first draw that equals each draw, which is evaluated only once."""
         return np.arange(self.n_draws)
 
+    # --- what is the same for both ---
+
+    @property
+    def of_counts(self) -> bool:
+        """Whether log-likelihoods are those of tick counts, comparable between families."""
+        return not np.isnan(self.shift).any()
+
     def given(self, some: np.ndarray) -> Iterator[Given]:
         """Yield the linear predictors of some draws, in chunks."""
-        raise NotImplementedError
+        for start in range(0, len(some), self.size):
+            index = some[start : start + self.size]
+            outer, c = self.outer(index)
+            predictor = self.density.predictor(outer, self.layout)
 
-    def draw(
-        self, given: Given, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+            u = inputs(self._U, len(self.label), c)
+            if np.ndim(outer.inputs.drift):
+                u = u + self.layout.rows(outer.inputs.drift)
+            mean = predictor.mean_given(u, self.label)
+            if np.ndim(outer.inputs.offset):
+                mean = mean + self.layout.rows(outer.inputs.offset)
+            yield Given(index, outer, predictor, mean)
+
+    def draw(self, given: Given, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw trust (draw, block, row) given the rates.
 
-        Also return the log-likelihoods (draw, mission), of tick counts if possible, and the log
-        prior density (draw,) of each parameter by name.
+        Also return the log-likelihoods (draw, mission), of tick counts if possible. Unless rates
+        are Gaussian, draws are weighted particles.
         """
-        raise NotImplementedError
+        draw = draw_exactly if self.density.is_gaussian else draw_particles
+        x, log_p = draw(self, given, rng)
+        return x, log_p + self.shift if self.of_counts else log_p
 
-    def prior(self, posterior: xr.DataTree, rng: np.random.Generator) -> "Source":
-        """Return `N_TRAJECTORIES` draws from the prior, evenly spaced in the group `prior`."""
-        raise NotImplementedError
+    def log_likelihood(self) -> np.ndarray:
+        """Compute the log-likelihoods (draw, mission) of `draw` for Gaussian rates."""
+        rng = np.random.default_rng(0)  # the draws of trust are not used
+        every = self.given(np.arange(self.n_draws))
+        return np.concatenate([self.draw(given, rng)[1] for given in every])
 
 
 class Latent(NamedTuple):
@@ -118,13 +153,13 @@ def latent_of(source: Source, kept: np.ndarray, rng: np.random.Generator, bar: t
     log_likelihood = []
     log_prior = []
     for given in source.given(first):
-        rows, log_p, of_prior = source.draw(given, rng)
+        rows, log_p = source.draw(given, rng)
         x = source.layout.unstack(rows)
         weight = share[np.searchsorted(first, given.some)]
         mean += np.tensordot(weight, x, 1)
         square += np.tensordot(weight, x**2, 1)
         log_likelihood.append(log_p)
-        log_prior.append(of_prior)
+        log_prior.append(source.log_prior(given))
 
         is_shown = np.isin(given.some, shown)
         trust.append(x[is_shown])
@@ -167,6 +202,38 @@ def draw_exactly(
     x = given.mean + (gain[:, kind] @ off[..., None])[..., 0]
     x += (root @ rng.standard_normal((*x.shape, 1)))[..., 0]
     return x, by_mission(log_sites[:, kind] - 0.5 * (w**2).sum(2), source)
+
+
+def draw_particles(
+    source: Any, given: Given, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw trust given rates of any family by weighted particles; see `draw_exactly`.
+
+    EP sites are those of `source.near`.
+    """
+    predictor = given.predictor
+    mean = given.mean
+    density = source.density
+    sites, _ = source.near.at(density.rates, predictor.noise_sd)
+    prior = density.columns.prior(given.outer.theta)
+    joint = ep.Joint(density.blocks, predictor, prior, density.rates)
+
+    # Draw particles of the predictor f; for each block, Gumbel noise chooses one by weight.
+    drawn = [ep.draw_predictors(joint, mean, sites, rng) for _ in range(_PARTICLES)]
+    f, log_w = (np.stack(part) for part in zip(*drawn, strict=True))
+    chosen = np.argmax(log_w + rng.gumbel(size=log_w.shape), axis=0)
+    f = np.take_along_axis(f, chosen[None, ..., None], axis=0)[0]
+    log_p = by_mission(logsumexp(log_w, axis=0) - np.log(_PARTICLES), source)
+
+    if predictor.shared_cov is None:  # the predictor is trust
+        return f, log_p
+
+    # Trust given the predictor f = trust + shared noise.
+    V = each(predictor.covariance, source.label)
+    S = each(predictor.trust_cov, source.label)
+    gain = np.swapaxes(np.linalg.solve(V, S), 2, 3)
+    x = mean + (gain @ (f - mean)[..., None])[..., 0]
+    return x + (root_of(S - gain @ S) @ rng.standard_normal((*x.shape, 1)))[..., 0], log_p
 
 
 def by_mission(of_blocks: np.ndarray, source: Source) -> np.ndarray:

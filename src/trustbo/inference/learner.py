@@ -36,9 +36,10 @@ from trustbo.inference.functions.fit import (
 )
 from trustbo.inference.functions.function import FunctionModel
 from trustbo.inference.functions.known import as_model, is_of_function, model_of_record
+from trustbo.inference.functions.missions import FunctionData
 from trustbo.inference.functions.sampling import NUTS
 from trustbo.inference.functions.sampling import SAMPLERS as OF_FUNCTIONS
-from trustbo.inference.functions.source import FunctionData, OfFunction
+from trustbo.inference.functions.source import OfFunction
 from trustbo.inference.latent import Source
 from trustbo.inference.options import Options
 from trustbo.inference.order import as_fitted, in_order_of_features

@@ -33,9 +33,8 @@ from trustbo.display import say, shows_bars, slow_bar
 from trustbo.errors import PosteriorError, TrustboError, require_switch, warn
 from trustbo.inference.density import at
 from trustbo.inference.fit import fit
-from trustbo.inference.functions.fit import log_likelihood_of_function
-from trustbo.inference.functions.known import as_model, is_of_function, model_of_record
-from trustbo.inference.learner import Model, add_latent
+from trustbo.inference.functions.known import is_of_function, model_of_record
+from trustbo.inference.learner import Model, add_latent, as_learner
 from trustbo.inference.order import as_fitted
 from trustbo.inference.posterior import names_in
 from trustbo.inference.stored import missions_of, read_posterior
@@ -254,7 +253,7 @@ def refit(posterior: xr.DataTree, model: Model, j: int) -> tuple[np.ndarray, flo
     if isinstance(model, TrustModel):
         log_p = ratio_of_evidence(fitted, missions, model)(j)
     else:
-        log_p = log_likelihood_of_function(fitted, missions, as_model(model))[0][:, j]
+        log_p = as_learner(model).source(fitted, missions).log_likelihood()[:, j]
     return log_p, float(fitted.attrs.get("k_hat", 0.0))
 
 

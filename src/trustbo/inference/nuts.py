@@ -25,7 +25,8 @@ from trustbo.arrays import evenly_spaced
 from trustbo.display import announced, slow_bar
 from trustbo.errors import TrustboError
 from trustbo.inference import importance
-from trustbo.inference.density import Density, JointDraws
+from trustbo.inference.class_target import ClassTarget
+from trustbo.inference.density import JointDraws
 from trustbo.inference.diagnostics import FIELDS, complaints_of, statistics_of
 from trustbo.inference.modes import at_modes
 from trustbo.models.backend import own_settings
@@ -268,7 +269,7 @@ class Chains:
 
 
 def sample_by_nuts(
-    density: Density,
+    target: ClassTarget,
     *,
     chains: int,
     draws: int,
@@ -279,7 +280,7 @@ def sample_by_nuts(
     """Sample the posterior of a model class.
 
     Args:
-        density: Density of a model given missions.
+        target: ClassTarget of a model given missions.
         chains: Number of chains.
         draws: Number of draws per chain.
         warmup: Number of warm-up draws per chain. The default is 150 for Gaussian rates, for which
@@ -292,21 +293,21 @@ def sample_by_nuts(
         checks.
     """
     rng = stream(seed, "nuts")
-    origin = at_modes(density.log_density, density.start()[None])
-    points = importance.sample(density.log_density, origin, rng, defensive=density.defensive).points
+    origin = at_modes(target.log_density, target.start()[None])
+    points = importance.sample(target.log_density, origin, rng, defensive=target.defensive).points
     z = points.x[points.resample(_POINTS, rng)]
 
-    tunings = [_OF_SCORES, _SHORT_STEPS] if density.is_gaussian else [_OF_PROGRAM]
+    tunings = [_OF_SCORES, _SHORT_STEPS] if target.is_gaussian else [_OF_PROGRAM]
     if warmup is not None:
         tunings = [tuning._replace(warmup=warmup) for tuning in tunings]
-    if density.is_gaussian:
-        log_density = in_jax(lambda z, _: z, density.log_density)
+    if target.is_gaussian:
+        log_density = in_jax(lambda z, _: z, target.log_density)
         start = Start.near(z, chains, seed)
-        constrain = density.scores.values
+        constrain = target.scores.values
     else:
-        log_density, start, constrain = _program(density, z, chains, seed)
+        log_density, start, constrain = _program(target, z, chains, seed)
 
-    who = type(density.model).__name__
+    who = type(target.model).__name__
     while True:
         tuning = tunings.pop(0)
         sampler = Chains(
@@ -315,14 +316,14 @@ def sample_by_nuts(
         )  # fmt: skip
         samples = sampler.run(start, draws)
         found = constrain(samples.points)
-        values = {name: found[name] for name in density.scores.priors}
+        values = {name: found[name] for name in target.scores.priors}
         by_chain = {name: v.reshape(chains, draws, *v.shape[1:]) for name, v in values.items()}
         summary, complaints = complaints_of(by_chain, samples.fields["diverging"])
         if not complaints or not tunings:
             break
 
-    theta = density.model.theta(values, density.observations.resolution)
-    c = density.draw_coefficients(theta, rng) if density.is_gaussian else found["coefficients"]
+    theta = target.model.theta(values, target.observations.resolution)
+    c = target.draw_coefficients(theta, rng) if target.is_gaussian else found["coefficients"]
     statistics = statistics_of({n: v.reshape(-1) for n, v in samples.fields.items()})
     return JointDraws(theta, c), statistics, summary, complaints
 
@@ -378,7 +379,7 @@ def in_jax(
 
 
 def _program(
-    density: Density, z: np.ndarray, chains: int, seed: int
+    target: ClassTarget, z: np.ndarray, chains: int, seed: int
 ) -> tuple[LogDensity, Start, Callable[[np.ndarray], dict[str, np.ndarray]]]:
     """Prepare the model's program for `Chains`.
 
@@ -388,10 +389,10 @@ def _program(
     """
 
     def program() -> None:
-        density.model.program(density.observations)
+        target.model.program(target.observations)
 
     with own_settings():
-        values = density.scores.values(z)
+        values = target.scores.values(z)
         center = {name: jnp.asarray(np.median(v, axis=0)) for name, v in values.items()}
         keys = jax.random.split(jax.random.key(seed), chains)
         found = initialize_model(keys, program, init_strategy=init_to_value(values=center))

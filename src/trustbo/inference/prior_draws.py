@@ -7,7 +7,7 @@ import numpy as np
 
 from trustbo.errors import require_count, require_kind, require_whole
 from trustbo.inference.ahead import with_prior_effects_ahead
-from trustbo.inference.density import Density
+from trustbo.inference.class_target import ClassTarget
 from trustbo.inference.variables import prior_parameters
 from trustbo.models.draws import NextMission
 from trustbo.models.model import TrustModel
@@ -94,12 +94,12 @@ def _settings_of(model: TrustModel) -> dict[str, Any]:
     return {**model.x0, "memory": model.memory, "family": model.family}
 
 
-def _prior(model: TrustModel, n_features: int, n_robots: int) -> Density:
-    """Make a `Density` without data or effects."""
+def _prior(model: TrustModel, n_features: int, n_robots: int) -> ClassTarget:
+    """Make a `ClassTarget` without data or effects."""
     n_features = require_count("n_features", n_features)
     n_robots = require_count("n_robots", n_robots)
 
     unmeasured = np.full((1, 1, n_robots), np.nan)
     z = np.zeros((1, 1, n_robots, n_features))
     observations = Observations(unmeasured, z, unmeasured, ("",) * n_features)
-    return Density(replace(model, effects=()), observations)
+    return ClassTarget(replace(model, effects=()), observations)

@@ -16,8 +16,9 @@ from trustbo.errors import (
     require_switch,
     require_whole,
 )
+from trustbo.inference.class_target import ClassTarget
 from trustbo.inference.classes import OfClass
-from trustbo.inference.density import Density, JointDraws
+from trustbo.inference.density import JointDraws
 from trustbo.inference.order import as_fitted
 from trustbo.inference.posterior import is_of_people
 from trustbo.inference.stored import read_posterior
@@ -103,9 +104,9 @@ def predict_reports(
             "posterior."
         )
 
-    density = Density(of_fit.model, of_fit.model.observations(missions))
+    target = ClassTarget(of_fit.model, of_fit.model.observations(missions))
     draws = draws.at(evenly_spaced(len(draws.c), n_draws))
-    ahead = _ahead(density, draws, given == "earlier")
+    ahead = _ahead(target, draws, given == "earlier")
     log_weight = _log_weights(ahead.log_p)
     if fitted or given == "none":
         log_weight = np.zeros(log_weight.shape)
@@ -119,11 +120,11 @@ def predict_reports(
             mean=ahead.mean[:, j],
             var=ahead.var[:, j],
             sd=sd,
-            report=density.observations.contact_rate[j],
-            ticks=density.observations.n_ticks[j],
+            report=target.observations.contact_rate[j],
+            ticks=target.observations.n_ticks[j],
         )
         rng = stream(seed, "reports", j)
-        found.append(_prediction(person, density.model.likelihood, levels, rng))
+        found.append(_prediction(person, target.model.likelihood, levels, rng))
 
     out = {name: np.stack([one[name] for one in found]) for name in found[0]}
     lengths = [len(mission.bounds) for mission in missions]
@@ -132,7 +133,7 @@ def predict_reports(
             values[j, n_bounds:] = np.nan
     for name in ("mean", "quantile"):
         out[name] = _answer_of(out[name], levels)
-    report = _answer_of(density.observations.contact_rate, levels)
+    report = _answer_of(target.observations.contact_rate, levels)
     return _dataset(report, out, levels, missions[0].robots)
 
 
@@ -147,17 +148,17 @@ class Person(NamedTuple):
     ticks: np.ndarray  # (bound, robot)
 
 
-def _ahead(density: Density, draws: JointDraws, earlier: bool) -> kalman.Ahead:
+def _ahead(target: ClassTarget, draws: JointDraws, earlier: bool) -> kalman.Ahead:
     """Predict trust (draw, mission, bound, robot) from the earlier reports of each person."""
-    observations = density.observations
-    layout = density.layout
+    observations = target.observations
+    layout = target.density.layout
     y = layout.rows(observations.contact_rate)
     if not earlier:
         y = np.full(y.shape, np.nan)
     ticks = layout.rows(observations.n_ticks)
 
     parts = []
-    source = OfClass(density, draws)
+    source = OfClass(target, draws)
     for given in source.given(np.arange(source.n_draws)):
         cov = each(given.predictor.covariance, source.label)
         sd = draws.theta["delta_v"][given.some, None, None]

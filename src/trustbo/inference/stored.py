@@ -10,7 +10,8 @@ import xarray as xr
 from trustbo.arrays import joined_draws
 from trustbo.data import Mission
 from trustbo.errors import TrustboError, require_kind
-from trustbo.inference.density import Density, JointDraws
+from trustbo.inference.class_target import ClassTarget
+from trustbo.inference.density import JointDraws
 from trustbo.inference.order import in_order_of
 from trustbo.inference.posterior import model_of
 from trustbo.inference.variables import draws_of
@@ -84,11 +85,11 @@ def values_of(posterior: xr.DataTree, effect: Effect) -> dict[str, np.ndarray]:
     return {name: joined_draws(group[name], of_name) for name, of_name in axes.items()}
 
 
-def stored_draws(density: Density, posterior: xr.DataTree) -> JointDraws:
+def stored_draws(target: ClassTarget, posterior: xr.DataTree) -> JointDraws:
     """Return the draws of a posterior, with chains joined."""
-    groups = {"posterior": parameters_of(posterior, density.model)}
-    groups |= {effect.group: values_of(posterior, effect) for effect in density.model.effects}
-    return draws_of(density, groups)
+    groups = {"posterior": parameters_of(posterior, target.model)}
+    groups |= {effect.group: values_of(posterior, effect) for effect in target.model.effects}
+    return draws_of(target, groups)
 
 
 def read_posterior(
@@ -96,8 +97,8 @@ def read_posterior(
     missions: Iterable[Mission] | None = None,
     *,
     model: TrustModel | None = None,
-) -> tuple[Density, JointDraws]:
-    """Rebuild the `Density` and the draws of a DataTree, with chains joined.
+) -> tuple[ClassTarget, JointDraws]:
+    """Rebuild the `ClassTarget` and the draws of a DataTree, with chains joined.
 
     Args:
         posterior: DataTree from `fit`.
@@ -119,8 +120,8 @@ def read_posterior(
     record = json.loads(posterior.attrs["model_record"])
     model = model_from_record(record, model).for_features(features)
 
-    density = Density(model, model.observations(missions))
-    return density, stored_draws(density, posterior)
+    target = ClassTarget(model, model.observations(missions))
+    return target, stored_draws(target, posterior)
 
 
 def missions_of(posterior: xr.DataTree) -> list[Mission]:

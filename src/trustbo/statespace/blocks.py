@@ -24,6 +24,8 @@ class Layout(NamedTuple):
     """Whether the inputs are carried over: True for all, False for none, or a mask (column,)."""
     apart: bool = False
     """Whether all blocks have different matrices."""
+    by_robot: bool = False
+    """Whether the matrices of each robot are its own; only if blocks are robots."""
 
     @classmethod
     def from_rates(
@@ -34,6 +36,7 @@ class Layout(NamedTuple):
         exchangeable: bool = False,
         carried: Any = True,
         apart: bool = False,
+        by_robot: bool = False,
     ) -> Self:
         """Choose the smallest independent blocks.
 
@@ -44,6 +47,7 @@ class Layout(NamedTuple):
                 all robots are measured together, their Helmert contrasts are independent.
             carried: See `Layout.carried`.
             apart: See `Layout.apart`.
+            by_robot: See `Layout.by_robot`.
         """
         n_missions, n_bounds, n_robots = y.shape
         shape = n_missions, n_bounds, n_robots
@@ -56,7 +60,13 @@ class Layout(NamedTuple):
             rotation = helmert(n_robots, full=True)
             return cls(shape, rotation=rotation, carried=carried, apart=apart)
 
-        return cls(shape, joint=joint, carried=carried, apart=apart)
+        return cls(shape, joint=joint, carried=carried, apart=apart, by_robot=by_robot)
+
+    @classmethod
+    def of_space(cls, space: StateSpace, y: np.ndarray) -> Self:
+        """Choose the smallest blocks of rates (mission, bound, robot) of a state-space form."""
+        n_groups = max(field.shape[1] for field in space if field is not None)
+        return cls.from_rates(y, joint=space.n_members > 1, by_robot=n_groups > 1)
 
     @property
     def label(self) -> np.ndarray:
@@ -65,7 +75,7 @@ class Layout(NamedTuple):
         if self.joint:
             return np.arange(n_missions) * int(self.apart)
 
-        others = np.zeros(n_robots, dtype=int)
+        others = np.arange(n_robots) * int(self.by_robot)
         if self.rotation is not None:
             others[1:] = 1
         return np.tile(others, n_missions)

@@ -21,15 +21,12 @@ from trustbo.inference.functions.draws import (
     function_drift,
     no_weights,
 )
-from trustbo.inference.functions.function import FunctionModel, in_batches
-from trustbo.inference.functions.sampling import (
-    keys_of,
-    require_gradient,
-    sampled,
-    targets_of,
-)
+from trustbo.inference.functions.function import BATCH, FunctionModel, in_batches, keys_of
+from trustbo.inference.functions.missions import FunctionData
+from trustbo.inference.functions.sampling import require_gradient, sampled
 from trustbo.inference.functions.sites import Site, safe
-from trustbo.inference.functions.source import OF_PRIOR, FunctionData, OfFunction
+from trustbo.inference.functions.source import OF_PRIOR, OfFunction
+from trustbo.inference.functions.target import targets_of
 from trustbo.inference.latent import N_PRIOR
 from trustbo.inference.options import Options
 from trustbo.inference.order import in_order_of
@@ -48,8 +45,6 @@ _UNBOUNDED = (
     "all rates are equal, and ContactRate has no n_ticks, so the density has no limit where the "
     "noises are 0: pass the input n_ticks to ContactRate(n_ticks=)"
 )
-_SIZE = 200
-"""Number of draws for which sites of `numpyro.deterministic` are computed at once."""
 
 
 def fit_function(
@@ -68,10 +63,10 @@ def fit_function(
     if workspace is not None:
         require_plannable(model, workspace)
     require_fittable(model, data, known.sites, [len(mission.bounds) for mission in missions])
-    effects = known.effects.effects
+    effects = known.density.columns.effects
 
     prior = known.run("prior", keys_of(N_PRIOR, options.seed + OF_PRIOR))
-    targets = targets_of(model, data, known.sites, known.effects if effects else None)
+    targets = targets_of(model, data, known.sites, known if effects else None)
     draws = options.draws or default_draws(effects, options.sampler)
     drawn = sampled(targets, prior, draws, options)
     if drawn.complaints and not known.resolution and _all_equal(known.observations):
@@ -122,21 +117,6 @@ def _all_equal(observations: Observations) -> bool:
     """Return whether all measured rates are equal."""
     rates = observations.contact_rate[~np.isnan(observations.contact_rate)]
     return bool(np.ptp(rates) == 0.0)
-
-
-def log_likelihood_of_function(
-    posterior: xr.DataTree, missions: Sequence[Mission], model: FunctionModel
-) -> tuple[np.ndarray, bool]:
-    """Compute the log-likelihood (draw, mission) of missions at all draws of a posterior.
-
-    The posterior may have been fitted to other rates of the same missions.
-
-    Returns:
-        The log-likelihoods, and whether they are of tick counts.
-    """
-    source = OfFunction.stored(FunctionData(model, missions), posterior)
-    parts = [given.log_likelihood for given in source.given(np.arange(source.n_draws))]
-    return np.concatenate(parts), source.of_counts
 
 
 def draws_of_function(
@@ -287,8 +267,8 @@ def _computed(
     n_draws = len(next(iter(values.values())))
     keys = keys_of(n_draws, 0)
     parts = []
-    for begin in range(0, n_draws, _SIZE):  # sites that are left out may be large
-        some = slice(begin, begin + _SIZE)
+    for begin in range(0, n_draws, BATCH):  # sites that are left out may be large
+        some = slice(begin, begin + BATCH)
         found = known.run("deterministic", at(values, some), keys[some])
         parts.append({name: found[name] for name in sites})
     return {name: np.concatenate([part[name] for part in parts]) for name in sites}

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Collection, Mapping
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from numpyro.infer.util import log_density
 from numpyro.primitives import sample
 
 from trustbo.identity import fingerprint, record_of
+from trustbo.inference.density import Outer
 from trustbo.inference.functions.data import RATES, Data, arrays_of
 from trustbo.inference.functions.explain import explained
 from trustbo.inference.functions.refusals import base_of
@@ -24,34 +25,10 @@ from trustbo.inference.functions.traced import TracedFunction
 from trustbo.models.backend import own_settings
 from trustbo.statespace import Inputs, StateSpace
 
-EFFECTS = "effects on the drift"
-"""Name of the sum of the effects among the values of `FunctionModel.evaluate`."""
 KIND = "function"
 """Value of the entry `class` in the record of a model that is a function."""
 BATCH = 128
 """Number of draws for which functions are compiled; a larger one is no faster."""
-
-
-class Outer(NamedTuple):
-    """Results of a function whose effects are to be integrated out, for one draw."""
-
-    log_p: Any
-    """Log density of all sites but the contact rates, shape ()."""
-    space: StateSpace
-    inputs: Inputs
-    theta: dict[str, Any]
-    """Hyperparameters of the effects; see `models.effects.Theta`."""
-
-
-class Found(NamedTuple):
-    """Results of a function for one draw of its variables."""
-
-    space: StateSpace
-    inputs: Inputs
-    log_prior: dict[str, Any]
-    """Log prior density of each element of each variable, in the shape of its plates."""
-    log_likelihood: Any
-    """Log density of each mission's rates, or log probability of its counts, shape (mission,)."""
 
 
 class FunctionModel(TracedFunction):
@@ -193,24 +170,20 @@ class FunctionModel(TracedFunction):
         trace = self.trace(values, key, data)
         return {n: site["value"] for n, site in trace.items() if site["type"] == "deterministic"}
 
-    def evaluate(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> Found:
+    def evaluate(self, values: Mapping[str, Any], key: jax.Array, data: Data) -> Outer:
         """Run the function with given values of some variables; draw the others from the prior.
 
-        `EFFECTS` is the sum (mission, bound, robot) of the effects on the drift, if there are any.
+        The result contains the log prior density of each element of each variable, in the shape of
+        its plates, but no `log_p`.
         """
-        values = dict(values)
-        effects = values.pop(EFFECTS, None)
         trace = self.trace(values, key, data)
         rates: Any = trace[RATES]["fn"]
-        if effects is not None:
-            rates = rates.given(effects)
-        return Found(
-            space=rates.space_with_resolution,
-            inputs=rates.inputs,
-            log_prior={
-                name: trace[name]["fn"].log_prob(trace[name]["value"]) for name in latent_in(trace)
-            },
-            log_likelihood=rates.log_prob(trace[RATES]["value"]),
+        log_prior = {
+            name: trace[name]["fn"].log_prob(trace[name]["value"]) for name in latent_in(trace)
+        }
+        zero = jnp.zeros(())
+        return Outer(
+            zero, rates.space_with_resolution, rates.inputs, rates.theta, log_prior=log_prior
         )
 
     def space_and_inputs(
@@ -291,6 +264,12 @@ def in_batches(compiled: Callable[..., Any], *draws: Any, size: int = BATCH) -> 
         for some in repeated.reshape(-1, size)
     ]
     return jax.tree.map(lambda *arrays: np.concatenate(arrays)[:n], *parts)
+
+
+def keys_of(n: int, seed: int) -> Any:
+    """Return n random keys."""
+    with own_settings():
+        return jax.random.split(jax.random.key(seed), n)
 
 
 def _transform_of(site: Mapping[str, Any], deviations: Collection[str]) -> Any:

@@ -1,6 +1,6 @@
 """The choice of a sampler for a NumPyro function, and the checks of its draws."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,17 +13,15 @@ from trustbo.display import slow_bar
 from trustbo.errors import TrustboError, warn
 from trustbo.inference.agreed import Chart, sample_charts
 from trustbo.inference.diagnostics import MAX_RHAT, MIN_ESS, complaints_of, statistics_of
-from trustbo.inference.functions.coordinates import Coordinates
-from trustbo.inference.functions.data import RATES, Data
-from trustbo.inference.functions.effects import AddedEffects
+from trustbo.inference.functions.data import RATES
 from trustbo.inference.functions.explain import reason_of
-from trustbo.inference.functions.function import FunctionModel, Outer, in_batches
-from trustbo.inference.functions.sites import Site, safe
+from trustbo.inference.functions.function import FunctionModel, keys_of
+from trustbo.inference.functions.sites import safe
+from trustbo.inference.functions.target import Scaled, Target
 from trustbo.inference.importance import Points
-from trustbo.inference.nuts import Chains, Compiled, Samples, Start, Tuning, compiled_with, in_jax
+from trustbo.inference.nuts import Chains, Samples, Start, Tuning
 from trustbo.inference.options import Options
 from trustbo.models.backend import own_settings
-from trustbo.statespace import Inputs, StateSpace
 from trustbo.streams import stream
 
 AUTO, IMPORTANCE, NUTS = SAMPLERS = ("auto", "importance", "nuts")
@@ -53,10 +51,6 @@ _NAMES_OF_FIELDS = {
 """Names of the fields of a form as arguments of `ContactRate`."""
 _CHECKED = 100
 """Largest number of measured bounds whose drift is checked."""
-_SPREAD = 1.4826
-"""Standard deviation of a normal distribution per median distance from its median."""
-_LEAST_SPREAD = 1e-9
-"""Smallest spread of a coordinate."""
 _N_STARTS = 1000
 """Largest number of draws of a previous posterior to which the first proposal is fitted."""
 
@@ -74,140 +68,6 @@ class Drawn(NamedTuple):
     """Failed checks."""
     effects: dict[str, dict[str, np.ndarray]] | None = None
     """Variables (draw, ...) of the effects of the function, by group and name."""
-
-
-class Target:
-    """Posterior of a function given data, in some coordinates.
-
-    Effects that the function adds to the drift are integrated out.
-    """
-
-    def __init__(
-        self,
-        model: FunctionModel,
-        data: Data,
-        sites: Mapping[str, Site],
-        coordinates: Coordinates,
-        effects: AddedEffects | None = None,
-    ) -> None:
-        self.model = model
-        self.data = data
-        self.sites = sites
-        self.coordinates = coordinates
-        self.effects = effects
-
-    def log_density(self, x: np.ndarray) -> np.ndarray:
-        """Compute the log density (point,) of points (point, coordinate)."""
-        if self.effects is None:
-            return self._in_batches("log density", self.traced, x)
-        return self._with_evidence(self.outer(x))
-
-    def outer(self, x: np.ndarray) -> Outer:
-        """Return the results of the function without its effects and rates at points."""
-        return self._in_batches("outer", self._outer, x)
-
-    def traced(self, x: Any, data: Data) -> Any:
-        """Compute the log density, up to a constant, at coordinates (coordinate,) in JAX."""
-        if self.effects is not None:
-            return in_jax(self._outer, self._with_evidence)(x, data)
-
-        z = self.coordinates.unconstrained(x)
-        log_jacobian = self.coordinates.log_jacobian(x)
-        return log_jacobian - self.model.potential(z, data, self.coordinates.deviations)
-
-    def _outer(self, x: Any, data: Data) -> Outer:
-        """Run the function at coordinates (coordinate,) in JAX, but for its effects and rates."""
-        z = self.coordinates.unconstrained(x)
-        found = self.model.outer(z, data, self.coordinates.deviations)
-        return found._replace(log_p=found.log_p + self.coordinates.log_jacobian(x))
-
-    def _with_evidence(self, outer: Outer) -> np.ndarray:
-        """Add the log evidence of the rates (point,), with the effects integrated out."""
-        effects: Any = self.effects
-        return outer.log_p + effects.log_evidence(*self._given(outer))
-
-    def draw_effects(
-        self, x: np.ndarray, rng: np.random.Generator
-    ) -> dict[str, dict[str, np.ndarray]] | None:
-        """Draw the effects of the function, if it has any, at points (draw, coordinate)."""
-        if self.effects is None:
-            return None
-        return self.effects.draw(*self._given(self.outer(x)), rng)
-
-    def _given(self, outer: Outer) -> tuple[StateSpace, Inputs, dict[str, np.ndarray]]:
-        """Return what `AddedEffects` takes at points, without the padding."""
-        effects: Any = self.effects
-        shape = effects.observations.contact_rate.shape
-        inputs = (value[:, : shape[0], : shape[1]].reshape(-1, *shape) for value in outer.inputs)
-        fields = [None if value is None else value[:, 0] for value in outer.space]
-        return StateSpace(*fields), Inputs(*inputs), outer.theta
-
-    def points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Convert values (draw, ...) of the variables to coordinates (draw, coordinate)."""
-
-        def one(values: Mapping[str, Any], data: Data) -> Any:
-            free = self.model.unconstrain(values, data, self.coordinates.deviations)
-            return self.coordinates.of(free)
-
-        return self._in_batches("points", one, dict(values))
-
-    def values(self, x: np.ndarray) -> dict[str, np.ndarray]:
-        """Convert coordinates (draw, coordinate) to values (draw, ...) of the variables."""
-
-        def one(x: Any, data: Data) -> Any:
-            free = self.coordinates.unconstrained(x)
-            return self.model.constrain(free, data, self.coordinates.deviations)
-
-        return self._in_batches("values", one, x)
-
-    def _in_batches(self, name: str, compute: Callable[..., Any], draws: Any) -> Any:
-        """Compute a function of draws, whose arrays have the axis (draw,); see `in_batches`."""
-        return in_batches(self.compiled((name,), compute, 1), draws)
-
-    def compiled(
-        self, key: tuple[Any, ...], compute: Callable[..., Any], n_draw_axes: int
-    ) -> Callable[..., Any]:
-        """Return a function of draws, compiled for these data; see `compiled_over_draws`."""
-        key = *key, self.coordinates.key
-        return self.model.compiled_over_draws(key, compute, n_draw_axes, self.data)
-
-    @property
-    def compiled_for_nuts(self) -> Compiled:
-        """Compiles functions of chains; again for each fit if NumPy computes a part of them."""
-        if self.effects is None:
-            return self.compiled
-        return lambda _, compute, n: compiled_with(compute, n, self.data)
-
-    def finite_points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return `points`, without draws that have infinite coordinates."""
-        x = self.points(values)
-        return x[np.isfinite(x).all(1)]
-
-
-def targets_of(
-    model: FunctionModel,
-    data: Data,
-    sites: Mapping[str, Site],
-    effects: AddedEffects | None = None,
-) -> list[Target]:
-    """Return the posterior in all coordinates in which it is sampled.
-
-    If means or standard deviations of normal variables are variables, too, the first coordinates
-    are deviations, and the second ones are not (centred and non-centred parametrisations;
-    Papaspiliopoulos, Roberts and Skold 2007). Deviations suit few data.
-    """
-    scales = model.over_draws("scales", 1, data)(keys_of(2, 0))
-    moving = [
-        name
-        for name, pair in scales.items()
-        if any(not np.array_equal(one[0], one[1]) for one in pair)
-    ]
-    free = model.free(data)
-    noises = model.noises(data)
-    return [
-        Target(model, data, sites, Coordinates(free, noises, deviations), effects)
-        for deviations in ((moving, ()) if moving else ((),))
-    ]
 
 
 def sampled(
@@ -235,12 +95,12 @@ def sampled(
             charts = [_chart(one, scaled[0], starts) for one in scaled]
             found = sample_charts(charts, seed, target.coordinates.names)
             found = found._replace(x=scaled[0].unscaled(found.x))
-        is_slow = target.effects is not None  # NUTS would take many minutes
+        is_slow = target.known is not None  # NUTS would take many minutes
         is_enough = sampler == AUTO and (is_slow or not found.complaints)
         if sampler == IMPORTANCE or is_enough:
             return _resampled(target, found, options.chains * draws, seed)
 
-    if target.effects is None:
+    if target.known is None:
         require_gradient(target)
     if found is None:
         x = target.finite_points(known or prior)
@@ -254,36 +114,6 @@ def sampled(
     if drawn.complaints and options.check and found is None:  # the start may be far away
         return sampled(targets, prior, draws, options._replace(start=None))
     return drawn
-
-
-class Scaled:
-    """A target in coordinates in which the prior has about the mean 0 and the scale 1."""
-
-    def __init__(self, target: Target, prior: Mapping[str, np.ndarray], bar: Any) -> None:
-        """Take middle and spread from draws of the prior; `bar` counts points."""
-        x = target.finite_points(prior)
-        self.target = target
-        self.bar = bar
-        self.middle = np.median(x, axis=0)
-        self.spread = _SPREAD * np.median(np.abs(x - self.middle), axis=0) + _LEAST_SPREAD
-        self.log_volume = np.log(self.spread).sum()
-
-    def log_density(self, z: np.ndarray) -> np.ndarray:
-        """Compute the log density (point,) of points (point, coordinate)."""
-        self.bar.update(len(z))
-        return self.target.log_density(self.unscaled(z)) + self.log_volume
-
-    def unscaled(self, z: np.ndarray) -> np.ndarray:
-        """Convert points to the coordinates of the target."""
-        return self.middle + self.spread * z
-
-    def points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Convert values (draw, ...) of the variables to points (draw, coordinate)."""
-        return (self.target.points(values) - self.middle) / self.spread
-
-    def values(self, z: np.ndarray) -> dict[str, np.ndarray]:
-        """Convert points (draw, coordinate) to values (draw, ...) of the variables."""
-        return self.target.values(self.unscaled(z))
 
 
 def _chart(own: Scaled, first: Scaled, starts: Sequence[Mapping[str, np.ndarray]]) -> Chart:
@@ -530,9 +360,3 @@ def require_gradient(target: Target) -> None:
             "jax.lax.scan for loops, or jax.lax.fori_loop with constant bounds, and define the "
             "gradient of callbacks with jax.custom_jvp or jax.custom_vjp."
         ) from error
-
-
-def keys_of(n: int, seed: int) -> Any:
-    """Return n random keys."""
-    with own_settings():
-        return jax.random.split(jax.random.key(seed), n)
