@@ -173,6 +173,8 @@ def test_the_filter_has_the_density_and_the_trust_of_the_joint_normal(name, offs
 class OfSpace(Source):
     """Draws of a form with known inputs (bound, robot) of one mission."""
 
+    size = 10_000
+
     def __init__(self, space, drift, of_bounds, observations):
         layout = Layout.of_space(space, observations.contact_rate)
         density = Density(Columns((), observations), layout, FAMILIES["gaussian"])

@@ -21,7 +21,7 @@ from trustbo.hazard.model import fit_hazard
 from trustbo.hazard.trials import CAUSES
 from trustbo.inference.diagnostics import diagnostics
 from trustbo.inference.fit import fit
-from trustbo.inference.learner import Learner
+from trustbo.inference.learns import Learner
 from trustbo.inference.tree import parameters_alone
 from trustbo.stacking import pooled
 from trustbo.workspace import Workspace

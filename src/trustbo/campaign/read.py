@@ -23,8 +23,10 @@ from trustbo.campaign.result import Result
 from trustbo.campaign.state import Entry, State
 from trustbo.errors import TrustboError, require_switch, warn
 from trustbo.files import FilePath, to_path
+from trustbo.inference.classes import ClassLearner
 from trustbo.inference.functions.known import is_of_function
-from trustbo.inference.learner import Learner, Model, learner_from_record
+from trustbo.inference.learner import Model, learner_from_record
+from trustbo.inference.learns import Learner
 from trustbo.logs.netcdf import missions_from_tree, read_tree
 from trustbo.planning.plan import plan_from_record
 from trustbo.workspace import Workspace
@@ -164,4 +166,4 @@ def _learner_of(state: State, model: Model | None) -> Learner:
         # A model class with priors of own classes is needed only if nothing has been learned.
         if state.last is None or model is not None or is_of_function(record):
             raise
-        return Learner(None)
+        return ClassLearner(None)

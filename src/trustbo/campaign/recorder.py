@@ -14,7 +14,7 @@ from trustbo.campaign.result import Result
 from trustbo.campaign.state import Entry, Exclusion, State
 from trustbo.errors import TrustboError, require_switch, require_whole, warn
 from trustbo.files import FilePath, holding_interrupts
-from trustbo.inference.learner import Learner
+from trustbo.inference.learns import Learner
 from trustbo.workspace import Workspace
 from trustbo.workspace.closed import require_closed
 

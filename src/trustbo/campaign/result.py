@@ -30,7 +30,8 @@ from trustbo.errors import (
 from trustbo.files import FilePath
 from trustbo.fixed import marked
 from trustbo.hazard.risk import BoundRisk
-from trustbo.inference.learner import Learner
+from trustbo.inference.learner import add_latent
+from trustbo.inference.learns import Learner
 from trustbo.inference.score import Posteriors
 from trustbo.models.backend import VERSIONS
 from trustbo.models.draws import Draws, NextMission
@@ -200,7 +201,7 @@ class Result(Summary):
 
         indices = np.atleast_1d(stored.attrs["missions"]).astype(int).tolist()
         used = fitted_missions(self.state, indices)
-        whole = self.learner.add_latent(stored, used, progress=self._progress)
+        whole = add_latent(stored, used, model=self.learner.model, progress=self._progress)
 
         for group in whole.children.values():
             if "mission" in group.dims:

@@ -10,7 +10,7 @@ from trustbo.errors import TrustboError, require_kind, require_switch
 from trustbo.files import to_json, to_plain
 from trustbo.hazard import Hazard
 from trustbo.inference.fit import fit, require_numbers_of_draws
-from trustbo.inference.learner import Learner
+from trustbo.inference.learns import Learner
 from trustbo.planning import Planner
 from trustbo.planning.policies import POLICIES, Policy
 from trustbo.workspace import Workspace

@@ -12,7 +12,9 @@ from scipy.special import logsumexp
 from trustbo.arrays import evenly_spaced
 from trustbo.data import Mission
 from trustbo.display import slow_bar
+from trustbo.errors import TrustboError
 from trustbo.inference import ep
+from trustbo.inference.ahead import read_params
 from trustbo.inference.class_target import ClassTarget
 from trustbo.inference.density import Coefficients, JointDraws, Outer, at
 from trustbo.inference.importance import ENOUGH, ROUNDS, SIZE, Points, Sampled, sample
@@ -22,15 +24,19 @@ from trustbo.inference.latent import (
     Given,
     Source,
 )
+from trustbo.inference.learns import Learner
 from trustbo.inference.mixture import Mixture
 from trustbo.inference.modes import LogDensity, at_modes, climb, climb_on
 from trustbo.inference.nuts import sample_by_nuts
 from trustbo.inference.options import Options
-from trustbo.inference.stored import parameters_of, stored_draws
+from trustbo.inference.prior_draws import prior_mean, sample_prior, sample_prior_ahead
+from trustbo.inference.stored import parameters_of, read_posterior, stored_draws
 from trustbo.inference.tree import Fitted, by_chain, default_draws
 from trustbo.inference.variables import prior_parameters, to_variables, with_prior_effects
 from trustbo.inference.weights import MAX_KHAT
+from trustbo.models.draws import Draws, NextMission
 from trustbo.models.model import TrustModel
+from trustbo.models.people import HumanTrust
 from trustbo.models.record import model_to_record
 from trustbo.models.scores import log_density
 from trustbo.stacking import require_same_robots
@@ -53,77 +59,114 @@ _MANY_SCORES = 13
 """Smallest number of scores for which a round has four times as many points."""
 
 
-def require_poolable_with_model(
-    model: TrustModel, earlier: Sequence[Mission], robots: Sequence[str]
-) -> None:
-    """Raise TrustboError if a model needs the same robots in all missions and `earlier` has others.
+class ClassLearner(Learner):
+    """Learner of a model class."""
 
-    A robot has no rates in the missions of other robots. Only models in which robots influence each
-    other cannot handle such gaps.
-    """
-    if model.joint and not model.exchangeable:
-        require_same_robots(type(model).__name__, earlier, robots)
+    samplers = SAMPLERS
 
+    def record(self) -> dict[str, Any]:
+        """See `Learner.record`."""
+        return model_to_record(self.known)
 
-def fit_class(
-    missions: Sequence[Mission],
-    model: TrustModel,
-    workspace: Workspace | None,
-    options: Options,
-) -> Fitted:
-    """Fit a model class to missions."""
-    model = model.for_features(missions[0].features)
-    target = ClassTarget(model, model.observations(missions, workspace))
-    record = json.dumps(model_to_record(model))
-    draws = options.draws or default_draws(model.effects, options.sampler)
-    if options.sampler == "importance":
-        first = _first_proposal(options.start, record)
-        with slow_bar("fit", " points", options.progress) as bar:
-            target.evaluated = bar.update
-            drawn, stats, summary = by_importance(
-                target, options.chains * draws, options.seed, first
+    def sampled(
+        self, missions: Sequence[Mission], workspace: Workspace | None, options: Options
+    ) -> Fitted:
+        """See `Learner.sampled`."""
+        model = self.known.for_features(missions[0].features)
+        target = ClassTarget(model, model.observations(missions, workspace))
+        record = json.dumps(model_to_record(model))
+        draws = options.draws or default_draws(model.effects, options.sampler)
+        if options.sampler == "importance":
+            first = _first_proposal(options.start, record)
+            with slow_bar("fit", " points", options.progress) as bar:
+                target.evaluated = bar.update
+                drawn, stats, summary = by_importance(
+                    target, options.chains * draws, options.seed, first
+                )
+
+            stats = {name: values[None] for name, values in stats.items()}  # in one chain
+            notes = {"sample_stats": {"proposal": summary.pop("proposal")}}
+            complaints = []
+            if not summary["k_hat"] <= MAX_KHAT:
+                reason = f"k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT}"
+                complaints.append(f"importance weights are uneven ({reason})")
+        else:
+            drawn, stats, summary, complaints = sample_by_nuts(
+                target,
+                chains=options.chains,
+                draws=draws,
+                warmup=options.warmup,
+                seed=options.seed,
+                progress=options.progress,
             )
+            stats = by_chain(stats, options.chains)
+            notes = {}
 
-        stats = {name: values[None] for name, values in stats.items()}  # in one chain
-        notes = {"sample_stats": {"proposal": summary.pop("proposal")}}
-        complaints = []
-        if not summary["k_hat"] <= MAX_KHAT:
-            reason = f"k-hat {summary['k_hat']:.2f}, limit {MAX_KHAT}"
-            complaints.append(f"importance weights are uneven ({reason})")
-    else:
-        drawn, stats, summary, complaints = sample_by_nuts(
-            target,
-            chains=options.chains,
-            draws=draws,
-            warmup=options.warmup,
-            seed=options.seed,
-            progress=options.progress,
+        resolution = target.observations.resolution if model.likelihood.adds_noise else 0.0
+        return Fitted(
+            variables=to_variables(target, drawn),
+            prior=prior_parameters(target, N_PRIOR, np.random.default_rng([options.seed, 3])),
+            dims=model.dims,
+            labels={},
+            effects=model.effects,
+            observations=target.observations,
+            statistics=stats,
+            attrs={
+                "model": type(model).__name__,
+                "model_record": record,
+                **_described(model),
+                "resolution": resolution,
+                "sampler": options.sampler,
+                **summary,
+            },
+            notes=notes,
+            by_position=False,
+            complaints=complaints,
+            source=lambda tree: OfClass(target, stored_draws(target, tree)),
         )
-        stats = by_chain(stats, options.chains)
-        notes = {}
 
-    resolution = target.observations.resolution if model.likelihood.adds_noise else 0.0
-    return Fitted(
-        variables=to_variables(target, drawn),
-        prior=prior_parameters(target, N_PRIOR, np.random.default_rng([options.seed, 3])),
-        dims=model.dims,
-        labels={},
-        effects=model.effects,
-        observations=target.observations,
-        statistics=stats,
-        attrs={
-            "model": type(model).__name__,
-            "model_record": record,
-            **_described(model),
-            "resolution": resolution,
-            "sampler": options.sampler,
-            **summary,
-        },
-        notes=notes,
-        by_position=False,
-        complaints=complaints,
-        source=lambda tree: OfClass(target, stored_draws(target, tree)),
-    )
+    def require_poolable(self, earlier: Sequence[Mission], robots: Sequence[str]) -> None:
+        """See `Learner.require_poolable`.
+
+        A robot has no rates in the missions of other robots. Only models in which robots influence
+        each other cannot handle such gaps.
+        """
+        if self.known.joint and not self.known.exchangeable:
+            require_same_robots(type(self.known).__name__, earlier, robots)
+
+    def source(
+        self, posterior: xr.DataTree, missions: Sequence[Mission], *, contrasts: bool = True
+    ) -> Source:
+        """See `Learner.source`."""
+        found = read_posterior(posterior, missions, model=self.model)
+        return OfClass(*found, contrasts=contrasts)
+
+    def read(
+        self, posterior: xr.DataTree, workspace: Workspace | None, next_mission: Sequence[bool]
+    ) -> Sequence[Draws]:
+        """See `Learner.read`."""
+        return read_params(posterior, workspace, next_mission)
+
+    def of_prior(self, n_draws: int, seed: int, whole: Workspace) -> Draws:
+        """See `Learner.of_prior`."""
+        model = self.known.for_features(whole.features)
+        sizes = len(whole.features), n_draws, seed
+        return sample_prior(model, *sizes, n_robots=whole.team.n_robots)
+
+    def of_prior_ahead(self, n_draws: int, seed: int, whole: Workspace) -> NextMission:
+        """See `Learner.of_prior_ahead`."""
+        model = self.known.for_features(whole.features)
+        return sample_prior_ahead(model, whole, n_draws, seed)
+
+    def mean_of_prior(self, whole: Workspace) -> Draws:
+        """See `Learner.mean_of_prior`."""
+        model = self.known.for_features(whole.features)
+        return prior_mean(model, len(whole.features), n_robots=whole.team.n_robots)
+
+    def require_plannable(self, workspace: Workspace, sampler: str | None) -> None:
+        """See `Learner.require_plannable`."""
+        if isinstance(self.model, HumanTrust):
+            raise TrustboError("model: HumanTrust cannot plan paths; give PooledTrust() instead.")
 
 
 def by_importance(
