@@ -68,7 +68,8 @@ def test_a_prediction_is_the_joint_normal_given_earlier_missions_averaged_over_d
     low, high = (scores["quantile"].sel(level=level, mission=0).values for level in (0.05, 0.95))
     for limit, level in ((low, 0.05), (high, 0.95)):
         below = stats.norm.cdf(limit, mean, sd).mean(0)
-        np.testing.assert_allclose(below, level, atol=6.0 * 0.22 / 4000**0.5)
+        # Draws repeat, so fewer are independent; few of them are in the tails.
+        np.testing.assert_allclose(below, level, atol=6.0 * 0.22 / 2000**0.5)
 
 
 @pytest.mark.parametrize("family", sorted(OF_FAMILY))
