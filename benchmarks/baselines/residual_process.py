@@ -37,8 +37,9 @@ class ResidualProcess(PathPolicy):
 
     __name__ = "residual process"
 
-    def __init__(self) -> None:
-        """Begin with line of sight."""
+    def __init__(self, n_sd: float = UPPER) -> None:
+        """Begin with line of sight; `n_sd` standard deviations are added to choose a path."""
+        self.n_sd = n_sd
         self.rates: list[tuple[tuple[int, int, int], float]] = []
         self._fitted: tuple[int, GaussianProcessRegressor] | None = None
 
@@ -49,7 +50,7 @@ class ResidualProcess(PathPolicy):
     def choose(self, planner: Planner, rng: np.random.Generator) -> Path:
         """Best path under upper quantiles."""
         mean, sd = self.estimate(line_of_sight(planner))
-        return best_paths(planner, np.clip(mean + UPPER * sd, 0.0, 1.0)[None])[0]
+        return best_paths(planner, np.clip(mean + self.n_sd * sd, 0.0, 1.0)[None])[0]
 
     def best(self, planner: Planner) -> Path:
         """Best path under the mean of the process."""
@@ -94,3 +95,13 @@ def places(bounds: np.ndarray) -> np.ndarray:
     """Middle of bounds (bound, 3), in cells, and the sine and cosine of their direction."""
     steps = np.array(MOVES)[bounds[:, 0] % len(MOVES)]
     return np.hstack([bounds[:, 1:] - 0.5 * steps, steps / np.linalg.norm(steps, axis=1)[:, None]])
+
+
+def greedy() -> ResidualProcess:
+    """Process that takes the path it holds for the best."""
+    return ResidualProcess(0.0)
+
+
+def optimistic() -> ResidualProcess:
+    """Process that takes the best path under upper quantiles."""
+    return ResidualProcess()

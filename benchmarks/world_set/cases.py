@@ -19,6 +19,11 @@ _BIRCH = "synthetic-birch"
 _CEDAR = "synthetic-cedar"
 _OF_14 = ("synthetic-0", "synthetic-1", _BIRCH, _CEDAR)
 """Synthetic terrains on which robots with a slope limit of 14 degrees can complete both courses."""
+_NAMES = (
+    "ash", "aspen", "beech", "cherry", "elm", "fir", "hazel", "hemlock", "holly", "juniper",
+    "larch", "linden", "maple", "oak", "pine", "poplar", "rowan", "spruce", "walnut", "willow",
+)  # fmt: skip
+"""Names of further synthetic terrains, over which the cases are dealt out; see `_dealt`."""
 _AFTER = 6
 """Index of the first mission after a change of the world, the seventh mission."""
 _DAYS = (1, 3, 4, 7)
@@ -170,10 +175,39 @@ _CASES: tuple[_Case, ...] = (
 def _all() -> list[World]:
     every = []
     for kind, case, grounds, settings in _CASES:
-        for ground in grounds:
-            name = f"{ground}-{case}" if case else ground
-            given = settings(ground) if callable(settings) else settings
-            every.append(World(name, kind, ground, **given))
+        every += [_world(kind, case, ground, settings) for ground in grounds]
+    return every + _dealt()
+
+
+def _world(
+    kind: str,
+    case: str,
+    ground: str,
+    settings: Mapping[str, Any] | Callable[[str], dict[str, Any]],
+) -> World:
+    name = f"{ground}-{case}" if case else ground
+    given = settings(ground) if callable(settings) else settings
+    return World(name, kind, ground, **given)
+
+
+def _dealt() -> list[World]:
+    """Deal out the cases over further terrains, so that there are thirty in all.
+
+    Each terrain gets one case with a right slope limit, and every second one a wrong limit as well.
+    The order of the cases is drawn by name. The true limit is 14 degrees, at which both diagonals
+    of all these terrains have a path.
+    """
+    grounds = [f"synthetic-{name}" for name in _NAMES]
+    right = {case: (kind, settings) for kind, case, _, settings in _CASES if kind != "limit"}
+    wrong = {"limit-4": 18.0, "limit-1": 15.0, "limit-2": 16.0, "limit-low-3": 11.0}
+
+    order = drawn("cases", "right limit").permutation(list(right))[: len(grounds)]
+    every = [_world(right[case][0], case, ground, right[case][1])
+             for ground, case in zip(grounds, order.tolist(), strict=True)]  # fmt: skip
+    order = drawn("cases", "wrong limit").permutation(list(wrong)).tolist()
+    for k, ground in enumerate(grounds[::2]):
+        case = order[k % len(order)]
+        every.append(_world("limit", case, ground, _limit(14.0, wrong[case])))
     return every
 
 
@@ -185,7 +219,7 @@ def worlds(data: FilePath | None = None) -> dict[str, World]:
             real terrain that can be used is wellington, which is included in the package.
 
     Returns:
-        Worlds on 6 synthetic and 4 real terrains.
+        Worlds on 26 synthetic and 4 real terrains.
     """
     folder = None if data is None else str(data)
     return {world.name: replace(world, data=folder) for world in _all()}

@@ -147,6 +147,10 @@ class World:
         )
         return _workspace(assumed, tuple(sorted(options.items())))
 
+    def true_workspace(self) -> Workspace:
+        """Make the workspace that a mission planner with a perfect map and team would have."""
+        return replace(self, aged=False, assumed=None, assumed_team=None).workspace()
+
     def simulator(self, workspace: Workspace) -> KinematicSimulator | RadioSimulator:
         """Make a simulator of the true world; posts and routes are from the assumed workspace."""
         terrain = self.true_terrain()
