@@ -47,7 +47,10 @@ import trustbo as tb
 from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.functions.data import arrays_of, data_of
 from trustbo.inference.functions.draws import draws_of_drift, function_drift
+from trustbo.inference.functions.function import keys_of
 from trustbo.inference.functions.known import as_model
+from trustbo.inference.functions.missions import FunctionData
+from trustbo.inference.functions.source import OfFunction
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.observations import Observations
 from trustbo.study import run_grid
@@ -374,9 +377,10 @@ def as_values(model, tree, missions):
     """Return the program of the class, and the class's draws as values of its variables."""
     of_features = model.for_features(missions[0].features)
     draws = tree["posterior"].to_dataset().stack(sample=("chain", "draw"))
-    values = {n: draws[n].values for n in ("beta0", "delta_w", "delta_v")}
+    names = [name for name in ("beta0", "delta_w", "delta_v", "f_v") if name in draws]
+    values = {name: draws[name].values for name in names}
     observations = of_features.observations(missions)
-    values["delta_v"] = of_features.noise_without(values["delta_v"], observations.resolution)
+    values |= of_features.noise_without(values, observations.resolution)
     theta = of_features.theta(values, observations.resolution)
     mean, _ = of_features.weights.moments(theta, observations)
     c = np.vstack([draws["beta"].transpose("feature", "sample").values, draws["b"].values]).T
@@ -387,13 +391,9 @@ def of_likelihoods(function, values, model, tree, missions):
     """Largest relative difference of log-likelihoods of the same draws."""
     whole = tb.inference.add_latent(tree, missions, model=model, progress=False)
     wanted = whole["log_likelihood"]["contact_rate"].values.reshape(-1, len(missions))
-    data = {"observations": model.observations(missions)}
-    data |= {"awareness": data["observations"].awareness,
-             "contact_rate": data["observations"].contact_rate,
-             "features": missions[0].features}  # fmt: skip
-    with jax.enable_x64(True):
-        keys = jax.random.split(jax.random.key(0), len(wanted))
-    found = function.over_draws("evaluate", 2, data)(values, keys).log_likelihood
+    known = FunctionData(function, missions)
+    source = OfFunction(known, values, keys_of(len(wanted), 0), lambda some, theta: some)
+    found = source.log_likelihood()
     return np.abs(found / wanted - 1.0).max()
 
 
