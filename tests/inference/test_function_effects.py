@@ -100,7 +100,7 @@ def target_of(function, missions):
 
 def dense_log_density(target, values):
     """Log density of all rates as one normal, whose means and covariances are summed in loops."""
-    effects = target.known.density.columns
+    effects = target.integrated.density.columns
     rates = effects.observations.contact_rate
     n_missions, n_bounds, n_robots = rates.shape
     theta = {name: np.atleast_1d(values[name]) for name in ("tau_slow", "tau_mission")}
@@ -157,8 +157,8 @@ def test_the_density_is_that_of_one_large_normal(function, missions):
     x = target.points(prior)
     found = target.log_density(x) - target.outer(x).log_p
 
-    n_missions, n_bounds, n_robots = target.known.observations.contact_rate.shape
-    resolution = target.known.observations.resolution
+    n_missions, n_bounds, n_robots = target.integrated.observations.contact_rate.shape
+    resolution = target.integrated.observations.resolution
     _, inputs = model.over_draws("space_and_inputs", 2, target.data)(prior, keys)
     for one in range(2):
         values = {name: v[one] for name, v in prior.items()}

@@ -49,10 +49,9 @@ _ROUND = 1024
 """Number of points of importance sampling per round."""
 _PRIOR_SCALE = 1.2
 """Scale of the defensive proposal; that of the prior is 1."""
-_ENOUGH = 500.0
-"""Effective number of points at which sampling stops."""
 _MORE = 8
-"""Factor by which both numbers are increased for a second attempt if the weights are uneven."""
+"""Factor by which this number and the effective number of points are increased for a second attempt
+if the weights are uneven."""
 _N_DRAWS = 1000
 """Number of posterior draws."""
 _SMALLEST_P = 1e-12
@@ -210,7 +209,7 @@ def sample(
     origin = at_modes(log_density, _starts(prior))
     for more in (1, _MORE):
         size = more * _ROUND
-        enough = more * _ENOUGH
+        enough = more * importance.ENOUGH
         found = importance.sample(
             log_density, origin, rng, size=size, enough=enough, defensive=_wider_prior
         )

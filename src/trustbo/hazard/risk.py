@@ -10,9 +10,9 @@ steps:
 3. A mission that was lost in an unknown bound of its path is counted as in step 2, for the bound
    that the draw assumes.
 
-All means are averages over the draws. Bounds that pass or fail together are one unit, and have the
-same probability, so the steps are taken once for each unit (see `hazard.units`). Results are maps
-by way and next way, as planners read them (see `workspace.moves`).
+All means are averages over the draws. Options of a bound that pass or fail together are one unit,
+and have the same probability, so the steps are taken once for each unit (see `hazard.units`).
+Results are maps by way and next way, as planners read them (see `workspace.moves`).
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,9 +1,10 @@
-"""Units of a workspace: the bounds that pass or fail together, and their place on maps.
+"""Units of the hazard: the options of a bound that pass or fail together, and their maps.
 
-How hard a bound is depends on its option: the set of posts from which T2 watches it, and the next
-way. In the same bound, options whose steepest route is the same form a unit. A unit is named by its
-move, row, column and first option. Values of units are computed once, and then spread over the maps
-that planners read, which are by way and next way; see `workspace.moves` for these words.
+An option of a bound is a set of posts from which T2 watches it, and the next way. Options of one
+bound with the same steepest route form a unit, and have one failure probability. For example, if
+two sets of posts lead T2 over the same slope, they are one unit. A unit is named by its move, row,
+column and first option. Values of units are computed once, and then spread over the maps that
+planners read, which are by way and next way; see `workspace.moves` for these words.
 """
 
 import numpy as np

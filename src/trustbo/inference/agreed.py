@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from trustbo.inference import importance
 from trustbo.inference.importance import Points, Rounds, Sampled, ratio, sample
 from trustbo.inference.mixture import MANY, Mixture, covariance_of
 from trustbo.inference.modes import LogDensity, at_modes
@@ -47,8 +48,9 @@ _LARGE = 2048
 """Number of points of a round that begins with the proposal of a search."""
 _MOST_LARGE = 24
 """Largest number of these rounds."""
-_ENOUGH = 1000.0
-"""Effective number of points of all charts of a run together at which it ends."""
+_ENOUGH = 2.0 * importance.ENOUGH
+"""Effective number of points of all charts of a run together at which it ends. Two runs are
+compared, and functions have more coordinates than classes, so more points are needed."""
 _LEAST = 500.0
 """The same below which a run has failed."""
 _N_SEEN = 384

@@ -267,48 +267,80 @@ def _draws(
     else:
         origin = first
 
-    at_once = is_last and not target.is_gaussian
-    visited: list[Coefficients] = []
-    corrected: list[np.ndarray] = []
-
-    def visit(z: np.ndarray) -> np.ndarray:
-        sites = target.sites_at(z) if at_once else None
-        log_p, coefficients = target.visit(z, rng, sites)
-        visited.append(coefficients)
-        if not at_once:
-            return log_p
-
-        some = np.flatnonzero(np.isfinite(log_p))
-        correction, c = _correction(target, z, coefficients, some, rng, _CORRECTIONS, sites)
-        log_p[some] = correction
-        corrected.append(c)
-        return log_p
+    way: _Exact | _CorrectedAtOnce | _CorrectedAfterwards
+    if target.is_gaussian:
+        way = _Exact(target, rng)
+    else:
+        way = (_CorrectedAtOnce if is_last else _CorrectedAfterwards)(target, rng)
 
     found = sample(
         target.log_density, origin, rng,
         is_known=first is not None, size=size, most=_LAST_ROUNDS if is_last else ROUNDS,
-        defensive=target.defensive, visit=visit,
+        defensive=target.defensive, visit=way.visit,
     )  # fmt: skip
     if first is not None and found.is_far and _is_elsewhere(target, found):
         return None
 
-    points = found.points
-    coefficients = Coefficients.joined(visited)
-
-    if target.is_gaussian:
-        chosen = points.resample(n, rng)
-        c = coefficients.draw(chosen, rng)
-    elif corrected:
-        chosen = points.resample(n, rng)
-        c = np.concatenate(corrected)[chosen]
-    else:
-        points, c = _corrected(target, points, coefficients, rng)
-        chosen = points.resample(n, rng)
-        c = c[chosen]
-
+    points, chosen, c = way.draw(found.points, n)
     summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}
     drawn = JointDraws(target.theta(points.x[chosen]), c)
     return drawn, points.log_p[chosen], summary | {"proposal": found.proposal.text}
+
+
+class _Exact:
+    """Visits of points with Gaussian rates, whose density and coefficients are exact."""
+
+    def __init__(self, target: ClassTarget, rng: np.random.Generator) -> None:
+        self.target = target
+        self.rng = rng
+        self.visited: list[Coefficients] = []
+
+    def visit(self, z: np.ndarray) -> np.ndarray:
+        """Return the log density (point,) of points, and keep their coefficients."""
+        log_p, coefficients = self.target.visit(z, self.rng)
+        self.visited.append(coefficients)
+        return log_p
+
+    def draw(self, points: Points, n: int) -> tuple[Points, np.ndarray, np.ndarray]:
+        """Return the points, the indices of n draws among them, and coefficients of the draws."""
+        chosen = points.resample(n, self.rng)
+        return points, chosen, Coefficients.joined(self.visited).draw(chosen, self.rng)
+
+
+class _CorrectedAfterwards(_Exact):
+    """Visits of points with the density of EP, which is corrected at all points in the end."""
+
+    def draw(self, points: Points, n: int) -> tuple[Points, np.ndarray, np.ndarray]:
+        """See `_Exact.draw`; the points have corrected weights."""
+        coefficients = Coefficients.joined(self.visited)
+        points, c = _corrected(self.target, points, coefficients, self.rng)
+        chosen = points.resample(n, self.rng)
+        return points, chosen, c[chosen]
+
+
+class _CorrectedAtOnce(_Exact):
+    """Visits of points at which EP is run and corrected, so that proposals follow the result."""
+
+    def __init__(self, target: ClassTarget, rng: np.random.Generator) -> None:
+        super().__init__(target, rng)
+        self.drawn: list[np.ndarray] = []
+
+    def visit(self, z: np.ndarray) -> np.ndarray:
+        """See `_Exact.visit`; here, coefficients are drawn."""
+        sites = self.target.sites_at(z)
+        log_p, coefficients = self.target.visit(z, self.rng, sites)
+        some = np.flatnonzero(np.isfinite(log_p))
+        correction, c = _correction(
+            self.target, z, coefficients, some, self.rng, _CORRECTIONS, sites
+        )
+        log_p[some] = correction
+        self.drawn.append(c)
+        return log_p
+
+    def draw(self, points: Points, n: int) -> tuple[Points, np.ndarray, np.ndarray]:
+        """See `_Exact.draw`."""
+        chosen = points.resample(n, self.rng)
+        return points, chosen, np.concatenate(self.drawn)[chosen]
 
 
 def _corrected(

@@ -95,12 +95,12 @@ def sampled(
             charts = [_chart(one, scaled[0], starts) for one in scaled]
             found = sample_charts(charts, seed, target.coordinates.names)
             found = found._replace(x=scaled[0].unscaled(found.x))
-        is_slow = target.known is not None  # NUTS would take many minutes
+        is_slow = target.integrated is not None  # NUTS would take many minutes
         is_enough = sampler == AUTO and (is_slow or not found.complaints)
         if sampler == IMPORTANCE or is_enough:
             return _resampled(target, found, options.chains * draws, seed)
 
-    if target.known is None:
+    if target.integrated is None:
         require_gradient(target)
     if found is None:
         x = target.finite_points(known or prior)

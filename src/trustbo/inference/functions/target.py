@@ -27,7 +27,8 @@ class Target:
         data: Its inputs.
         sites: Its variables by name.
         coordinates: The coordinates.
-        known: The function with its missions, if its effects are to be integrated out; else None.
+        integrated: The function with its missions, if it has effects, which are integrated out by
+            `Density` in NumPy; None if JAX computes the whole density.
     """
 
     def __init__(
@@ -36,17 +37,17 @@ class Target:
         data: Data,
         sites: Mapping[str, Site],
         coordinates: Coordinates,
-        known: FunctionData | None = None,
+        integrated: FunctionData | None = None,
     ) -> None:
         self.model = model
         self.data = data
         self.sites = sites
         self.coordinates = coordinates
-        self.known = known
+        self.integrated = integrated
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """Compute the log density (point,) of points (point, coordinate)."""
-        if self.known is None:
+        if self.integrated is None:
             return self._in_batches("log density", self.traced, x)
         return self._with_evidence(self.outer(x))
 
@@ -56,7 +57,7 @@ class Target:
 
     def traced(self, x: Any, data: Data) -> Any:
         """Compute the log density, up to a constant, at coordinates (coordinate,) in JAX."""
-        if self.known is not None:
+        if self.integrated is not None:
             return in_jax(self._outer, self._with_evidence)(x, data)
 
         z = self.coordinates.unconstrained(x)
@@ -71,17 +72,17 @@ class Target:
 
     def _with_evidence(self, outer: Outer) -> np.ndarray:
         """Compute the log density (point,), with the effects integrated out."""
-        known: Any = self.known
+        known: Any = self.integrated
         return known.density.log_density(known.unpadded(outer)) + known.log_resolution
 
     def draw_effects(
         self, x: np.ndarray, rng: np.random.Generator
     ) -> dict[str, dict[str, np.ndarray]] | None:
         """Draw the effects of the function, if it has any, at points (draw, coordinate)."""
-        if self.known is None:
+        if self.integrated is None:
             return None
-        outer = self.known.unpadded(self.outer(x))
-        density = self.known.density
+        outer = self.integrated.unpadded(self.outer(x))
+        density = self.integrated.density
         return density.columns.to_variables(density.draw_coefficients(outer, rng), outer.theta)
 
     def points(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -116,7 +117,7 @@ class Target:
     @property
     def compiled_for_nuts(self) -> Compiled:
         """Compiles functions of chains; again for each fit if NumPy computes a part of them."""
-        if self.known is None:
+        if self.integrated is None:
             return self.compiled
         return lambda _, compute, n: compiled_with(compute, n, self.data)
 
@@ -130,7 +131,7 @@ def targets_of(
     model: FunctionModel,
     data: Data,
     sites: Mapping[str, Site],
-    known: FunctionData | None = None,
+    integrated: FunctionData | None = None,
 ) -> list[Target]:
     """Return the posterior in all coordinates in which it is sampled.
 
@@ -147,7 +148,7 @@ def targets_of(
     free = model.free(data)
     noises = model.noises(data)
     return [
-        Target(model, data, sites, Coordinates(free, noises, deviations), known)
+        Target(model, data, sites, Coordinates(free, noises, deviations), integrated)
         for deviations in ((moving, ()) if moving else ((),))
     ]
 
