@@ -27,7 +27,7 @@ TOP_FILES = {
 }
 KINDS = {
     ".ci": {""},
-    "benchmarks": {".csv", ".md", ".py", ".toml"},
+    "benchmarks": {".csv", ".md", ".py", ".toml", ".txt"},
     "docs": {".bib", ".css", ".md", ".png", ".py", ".rst"},
     "examples": {".py", ".sh", ".toml", ".txt"},
     "notebooks": {".ipynb"},

@@ -1,15 +1,16 @@
 """List tables, figures and notebooks that the present code may not reproduce.
 
-    python scripts/gate.py              list them; the exit status is 1 if there are any
-    python scripts/gate.py stamp NAME   record that NAME was computed with the present commit
-    python scripts/gate.py same NAME --part COMMAND
-                                        record that COMMAND, a part of NAME, gives the same results
-                                        as before the change of the code
+    python scripts/gate.py                     list them; the exit status is 1 if there are any
+    python scripts/gate.py run NAME            run the command of NAME, and record that its results
+                                               are those of the present code
+    python scripts/gate.py run NAME --part COMMAND
+                                               the same, but run only a part of it, whose results
+                                               were the same as before
 
-`benchmarks/provenance.toml` states from which commit each table, figure and notebook comes, and
-which code it measures. An entry is stale if this code has changed since the commit. Changes of
-comments, docstrings and the layout of Python code do not count: the syntax trees are compared. All
-other files count if any byte has changed.
+`benchmarks/provenance.toml` states how each table, figure and notebook was computed, with which
+commit, and the digest of the code that ran; `benchmarks/closures` names that code (see
+`closure.py`). An entry is stale if the content of this code is another one now. Code that its
+command does not call does not count, and neither do comments, docstrings and layout.
 
 Entries must cover all files in `FILES`, and all tables of results in README and docs, which are the
 Markdown tables with a right-aligned column. `docs/worlds.md#the-tables` stands for all tables of a
@@ -18,8 +19,6 @@ with a title, has this title.
 """
 
 import argparse
-import ast
-import functools
 import json
 import re
 import subprocess
@@ -31,12 +30,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
+import closure
 from check_files import tracked
 
 ROOT = Path(__file__).resolve().parents[1]
 MANIFEST = "benchmarks/provenance.toml"
+CLOSURES = "benchmarks/closures"
 FILES = ("benchmarks/reference/*.csv", "docs/figures/*", "notebooks/*.ipynb")
-UNKNOWN = "unknown"
 
 
 class Entry(NamedTuple):
@@ -48,39 +48,31 @@ class Entry(NamedTuple):
     run: str
     """Command that computes them."""
     commit: str
-    code: tuple[str, ...]
-    """Pathspecs of git; empty for results of earlier versions, which do not become stale."""
-    same: str = ""
-    """Later commit with which a part of them was computed again, and equal; "" if there is none."""
+    """Commit of the code that computed them, or with which a part was computed again."""
+    digest: str = ""
+    """Digest of the code that ran; "" if none was recorded."""
     part: str = ""
-    """Command that computes this part."""
-
-    @property
-    def checked(self) -> str:
-        """Last commit that gives these results, as far as it was checked."""
-        return self.same or self.commit
+    """Command that computed a part of them again with this code; "" if all were computed."""
+    earlier: bool = False
+    """Whether they are of an earlier version, and kept for comparison; they are never stale."""
 
 
 def main() -> None:
-    """List stale entries, or stamp entries."""
+    """List stale entries, or compute entries again."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     commands = parser.add_subparsers(dest="command")
-    stamped = commands.add_parser("stamp", help="write the present commit into entries")
-    same = commands.add_parser("same", help="record that a part was computed again, and is equal")
-    for command in (stamped, same):
-        command.add_argument("names", nargs="+", metavar="NAME")
-    stamped.set_defaults(part="")
-    same.add_argument("--part", required=True, metavar="COMMAND", help="what was run")
+    run = commands.add_parser("run", help="compute an entry, and record the code that ran")
+    run.add_argument("name", metavar="NAME")
+    run.add_argument("--part", default="", metavar="COMMAND", help="run this command instead")
     given = parser.parse_args()
 
     if given.command is not None:
-        for name in given.names:
-            print(f"{name}: {stamp(ROOT, name, given.part)}")
+        print(f"{given.name}: {record(ROOT, given.name, given.part)}")
         return
 
     found = list(faults(ROOT))
     print("\n".join(found) or "all tables, figures and notebooks are of the present code")
-    entries = [entry for entry in read_manifest(ROOT) if entry.same]
+    entries = [entry for entry in read_manifest(ROOT) if entry.part]
     for part in dict.fromkeys(entry.part for entry in entries):
         names = [entry.name for entry in entries if entry.part == part]
         print(f"of {', '.join(names)}, only a part was run again: {part}")
@@ -99,27 +91,16 @@ def faults(root: Path) -> Iterator[str]:
         for shown in entry.shows:
             if not any(covers(shown, result) for result in results):
                 yield f"{entry.name}: {shown} does not exist"
-        for path in entry.code:
-            if not git(root, "ls-files", "--", path):
-                yield f"{entry.name}: there is no code in {path}"
         if reason := why_stale(root, entry):
             yield "\n    ".join([f"{entry.name}: {reason}", *entry.shows, f"run: {entry.run}"])
 
 
 def read_manifest(root: Path) -> list[Entry]:
-    """Return the entries of the manifest, in whose code the names of groups are replaced."""
+    """Return the entries of the manifest."""
     tables = tomllib.loads((root / MANIFEST).read_text())
-    groups = tables.pop("code")
+    fields = [name for name in Entry._fields if name not in ("name", "shows")]
     return [
-        Entry(
-            name=name,
-            shows=tuple(table["shows"]),
-            run=table["run"],
-            commit=table["commit"],
-            code=tuple(path for item in table["code"] for path in groups.get(item, [item])),
-            same=table.get("same", ""),
-            part=table.get("part", ""),
-        )
+        Entry(name, tuple(table["shows"]), **{k: table[k] for k in fields if k in table})
         for name, table in tables.items()
     ]
 
@@ -152,96 +133,79 @@ def covers(shown: str, result: str) -> bool:
 
 def why_stale(root: Path, entry: Entry) -> str:
     """Return why an entry is stale, or an empty text if it is not."""
-    if entry.commit == UNKNOWN:
-        return "nobody has recorded with which commit it was computed"
-
-    in_history = subprocess.run(
-        ["git", "-C", str(root), "merge-base", "--is-ancestor", entry.checked, "HEAD"],
-        capture_output=True,
-        check=False,
-    )
-    if in_history.returncode != 0:
-        return (
-            f"commit {entry.checked} is not in the history of HEAD; compute it again, or fetch the "
-            "whole history if this is a shallow clone"
-        )
-
-    changed = [] if not entry.code else changed_files(root, entry)
-    if not changed:
+    if entry.earlier:
         return ""
+    if not entry.digest:
+        return "nobody has recorded the code that computed it"
+
+    called = closure.read(file_of(root, entry.name))
+    if closure.digest(root, called) == entry.digest:
+        return ""
+    changed = changes(root, entry.commit, called)
+    if not changed:
+        return f"code has changed since {entry.commit}"
     more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-    return f"code has changed since {entry.checked}: {changed[0]}{more}"
+    return f"code has changed since {entry.commit}: {changed[0]}{more}"
 
 
-def changed_files(root: Path, entry: Entry) -> list[str]:
-    """Return the files of an entry whose code differs between its commit and the working tree."""
-    command = ("diff", "--name-only", "--no-renames", "-z", entry.checked, "--", *entry.code)
-    names = git(root, *command).split("\0")
-    return [name for name in names if name and not same_code(root, entry.checked, name)]
+def changes(root: Path, commit: str, called: closure.Closure) -> list[str]:
+    """Return the functions and modules whose content has changed since a commit, if it is known."""
+    changed = []
+    for file in called:
+        of_file = {file: called[file]}
+        done = git(root, "show", f"{commit}:{file}", check=False)
+        before = closure.functions_of(done) if done else {}
+        after = closure.contents(root, of_file)
+        names = [name for name in ("", *sorted(called[file])) if name in before]
+        changed += [
+            f"{file} {name}".rstrip()
+            for name in names
+            if before[name] != after.get(f"{file}::{name}")
+        ]
+    return changed
 
 
-@functools.cache
-def same_code(root: Path, commit: str, name: str) -> bool:
-    """Return whether a file that has changed since a commit has the same code as before."""
-    file = root / name
-    was_there = bool(git(root, "ls-tree", "--name-only", commit, "--", name))
-    if file.suffix != ".py" or not file.exists() or not was_there:
-        return False
-    return code_of(git(root, "show", f"{commit}:{name}")) == code_of(file.read_text())
+def file_of(root: Path, name: str) -> Path:
+    """Return the file with the closure of an entry."""
+    return root / CLOSURES / f"{name}.txt"
 
 
-def code_of(text: str) -> str:
-    """Return the syntax tree of Python code without docstrings."""
-    tree = ast.parse(text)
-    for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):  # also texts below constants and fields, which describe them
-            node.body = [part for part in body if not is_text(part)]
-    return ast.dump(tree)
-
-
-def is_text(node: ast.AST) -> bool:
-    """Return whether a statement is a text alone."""
-    return (
-        isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    )
-
-
-def stamp(root: Path, name: str, part: str = "") -> str:
-    """Write the present commit into an entry of the manifest, and return the commit.
-
-    If only a `part` was computed again, the entry keeps the commit of its results.
-    """
+def record(root: Path, name: str, part: str = "") -> str:
+    """Run the command of an entry, or a part, and record the code that ran; return the commit."""
     entries = {entry.name: entry for entry in read_manifest(root)}
     if name not in entries:
         sys.exit(f"{MANIFEST} has no entry {name!r}; it has {', '.join(entries)}")
-    code = entries[name].code
-    changes = git(root, "status", "--porcelain", "--", *code) if code else ""
-    if changes:
-        sys.exit(f"commit the code of {name} first, and compute it again; changed are\n{changes}")
+    if changes_of_code := git(root, "status", "--porcelain", "--", *closure.FOLDERS).strip():
+        sys.exit(f"commit the code of {name} first; changed are\n{changes_of_code}")
 
     commit = git(root, "rev-parse", "--short=8", "HEAD").strip()
-    before, head, after = (root / MANIFEST).read_text().partition(f"[{name}]\n")
-    own, rest = re.match(r"(.*?)(^\[.*|\Z)", after, flags=re.S | re.M).groups()
-    own = re.sub(r"^(same|part) = .*\n", "", own, flags=re.M)
-    lines = f'commit = "{commit}"'
-    if part:
-        lines = f'commit = "{entries[name].commit}"\nsame = "{commit}"\npart = {json.dumps(part)}'
-    own = re.sub(r'^commit = ".*"(?: *#.*)?$', lambda _: lines, own, count=1, flags=re.M)
-    (root / MANIFEST).write_text(before + head + own + rest)
+    called = closure.run_traced(root, part or entries[name].run)
+    file = file_of(root, name)
+    if part:  # which may not call all that the whole does
+        called = closure.joined(closure.read(file), called)
+    closure.write(file, called, root)
+    fields = {"commit": commit, "digest": closure.digest(root, closure.read(file)), "part": part}
+    _write_fields(root / MANIFEST, name, fields)
     return commit
 
 
-def git(root: Path, *command: str) -> str:
-    """Return what a command of git prints."""
+def _write_fields(manifest: Path, name: str, fields: dict[str, str]) -> None:
+    """Write fields of an entry below its others; empty ones are left out."""
+    before, head, after = manifest.read_text().partition(f"[{name}]\n")
+    own, rest = re.match(r"(.*?)(\n*^\[.*|\n*\Z)", after, flags=re.S | re.M).groups()
+    own = re.sub(rf"^({'|'.join(fields)}) = .*(\n|\Z)", "", own, flags=re.M).rstrip("\n")
+    lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items() if value]
+    manifest.write_text(before + head + "\n".join([own, *lines]) + rest)
+
+
+def git(root: Path, *command: str, check: bool = True) -> str:
+    """Return what a command of git prints; if it fails, exit, or return "" without `check`."""
     done = subprocess.run(
         ["git", "-C", str(root), *command], capture_output=True, text=True, check=False
     )
-    if done.returncode != 0:
+    if done.returncode != 0 and check:
         sys.exit(f"git {command[0]} failed: {done.stderr.strip()}")
-    return done.stdout
+    return done.stdout if done.returncode == 0 else ""
 
 
 if __name__ == "__main__":
