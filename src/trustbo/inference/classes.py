@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -17,7 +17,7 @@ from trustbo.inference import ep
 from trustbo.inference.ahead import read_params
 from trustbo.inference.class_target import ClassTarget
 from trustbo.inference.density import Coefficients, JointDraws, Outer, at
-from trustbo.inference.importance import ENOUGH, ROUNDS, SIZE, Points, Sampled, sample
+from trustbo.inference.importance import ROUNDS, SIZE, Points, Sampled, sample
 from trustbo.inference.latent import (
     N_PRIOR,
     N_TRAJECTORIES,
@@ -26,7 +26,7 @@ from trustbo.inference.latent import (
 )
 from trustbo.inference.learns import Learner
 from trustbo.inference.mixture import Mixture
-from trustbo.inference.modes import LogDensity, at_modes, climb, climb_on
+from trustbo.inference.modes import LogDensity, at_modes, climb_on
 from trustbo.inference.nuts import sample_by_nuts
 from trustbo.inference.options import Options
 from trustbo.inference.prior_draws import prior_mean, sample_prior, sample_prior_ahead
@@ -48,8 +48,12 @@ _NEGLIGIBLE = 0.01
 """Weight of a point, relative to the mean weight, below which EP is not corrected there."""
 _LAST_SIZE = 1024
 """Points per round of the last attempt, if rates are Gaussian."""
-_LAST_ROUNDS = 12
-"""Largest number of rounds of the last attempt. Some curved posteriors need more than usual."""
+_MORE_ROUNDS = 12
+"""Largest number of rounds of the last attempt, as some curved posteriors need more than usual, and
+of attempts from a first proposal that is given, which may have to move."""
+_FEW = 125.0
+"""Effective number of points below which points from a given proposal that was far away may still
+be on their way to the posterior."""
 _CORRECTIONS = 4
 """Number of draws of the coefficients by which EP is corrected at each point in the last attempt,
 if rates are not Gaussian."""
@@ -174,24 +178,29 @@ def by_importance(
 ) -> tuple[JointDraws, dict[str, np.ndarray], dict[str, Any]]:
     """Take n draws by importance sampling; return the draws, statistics (draw,) and a summary.
 
-    `first` is the first proposal. By default, or if its weights are uneven or it leads to another
-    mode, the first proposal is found by a search for the mode. If these weights are uneven as well,
-    the search goes on from its end, and there are more rounds, which are larger. Unless rates are
-    Gaussian, EP is corrected at each point instead of drawing larger rounds.
+    `first` is the first proposal. By default, or if its weights are uneven, the first proposal is
+    found by a search for the mode. If these weights are uneven as well, there are more rounds,
+    which are larger. Unless rates are Gaussian, EP is corrected at each point instead of drawing
+    larger rounds.
     """
     rng = np.random.default_rng(seed)
     last_size = _LAST_SIZE if target.is_gaussian else SIZE
     attempts = [(SIZE, None), (last_size, None)]
     if first and _is_possible(target, first):
         attempts = [(SIZE, first), *attempts]
+    was_elsewhere = False
     while True:
         size, proposal = attempts.pop(0)
         if target.n_scores >= _MANY_SCORES:
             size = 4 * size
 
         is_last = not attempts
-        found = _draws(target, n, size, rng, proposal, is_last)
-        if found is None:
+        may_be_elsewhere = proposal is not None and not was_elsewhere
+        found = _draws(target, n, size, rng, proposal, is_last, may_be_elsewhere)
+        if isinstance(found, Elsewhere):
+            was_elsewhere = True
+            if found.both is not None:
+                attempts = [(SIZE, found.both), *attempts]
             continue
 
         drawn, log_p, summary = found
@@ -217,23 +226,35 @@ def _is_possible(target: ClassTarget, first: Mixture) -> bool:
     return False
 
 
-def _is_elsewhere(target: ClassTarget, found: Sampled) -> bool:
+class Elsewhere(NamedTuple):
+    """Result of an attempt whose points may not represent the posterior."""
+
+    both: Mixture | None = None
+    """Proposal of the points and of a mode that they missed, if there is one."""
+
+
+def _elsewhere(target: ClassTarget, found: Sampled) -> Elsewhere | None:
     """Return whether points whose first proposal was far away do not represent the posterior.
 
-    They may be on the way to it, with too few effective points when the rounds end, or at a lower
-    mode than the search for the mode finds. Unless rates are Gaussian, their density is that of EP
-    near the first proposal, which is not accurate elsewhere.
+    They may be on the way to it, with too few effective points when the rounds end, or may have
+    missed a mode that the search for the mode finds, or a ridge where this search ends. Unless
+    rates are Gaussian, their density is that of EP near the first proposal, which is not accurate
+    elsewhere.
     """
     if not target.is_gaussian:
         target.density.reset_ep()
-        return True
+        return Elsewhere()
     points = found.points
     if points.k_hat > MAX_KHAT:
-        return False  # the search follows in any case
-    if points.kish < ENOUGH:
-        return True
+        return None  # the search follows in any case
+    if points.kish < _FEW:
+        return Elsewhere()
 
-    return misses(found, target.log_density, climb(target.log_density, target.start()))
+    mode = climb_on(target.log_density, target.start())
+    if not misses(found, target.log_density, mode):
+        return None
+    parts = [found.proposal, at_modes(target.log_density, mode[None])]
+    return Elsewhere(Mixture.joined(parts, np.full(len(parts), 1.0 / len(parts))))
 
 
 def misses(found: Sampled, log_density: LogDensity, mode: np.ndarray) -> bool:
@@ -250,20 +271,19 @@ def _draws(
     rng: np.random.Generator,
     first: Mixture | None,
     is_last: bool,
-) -> tuple[JointDraws, np.ndarray, dict[str, Any]] | None:
+    may_be_elsewhere: bool,
+) -> tuple[JointDraws, np.ndarray, dict[str, Any]] | Elsewhere:
     """Take n draws, beginning with the proposal `first` or with a search for the mode.
 
-    Returns None if `first` was so far away that the points may not represent the posterior.
+    If `first` may be elsewhere, and was so far away that the points may not represent the
+    posterior, the result is `Elsewhere`.
 
     Unless rates are Gaussian, the density of EP is corrected at the points in the end. In the last
     attempt, EP is run and corrected at each visited point instead, so that later proposals are
     fitted to the corrected density.
     """
     if first is None:
-        start = target.start()
-        if is_last:
-            start = climb_on(target.log_density, start)
-        origin = at_modes(target.log_density, start[None])
+        origin = at_modes(target.log_density, target.start()[None])
     else:
         origin = first
 
@@ -275,11 +295,14 @@ def _draws(
 
     found = sample(
         target.log_density, origin, rng,
-        is_known=first is not None, size=size, most=_LAST_ROUNDS if is_last else ROUNDS,
+        is_known=first is not None, size=size,
+        most=_MORE_ROUNDS if is_last or first is not None else ROUNDS,
         defensive=target.defensive, visit=way.visit,
     )  # fmt: skip
-    if first is not None and found.is_far and _is_elsewhere(target, found):
-        return None
+    if may_be_elsewhere and found.is_far:
+        elsewhere = _elsewhere(target, found)
+        if elsewhere is not None:
+            return elsewhere
 
     points, chosen, c = way.draw(found.points, n)
     summary = {name: getattr(points, name) for name in ("k_hat", "kish", "log_evidence")}

@@ -47,7 +47,7 @@ def at_modes(log_density: LogDensity, starts: np.ndarray) -> Mixture:
     """Fit a component at each distinct mode that is reached from starts (start, score)."""
     found: list[tuple[float, Mixture]] = []
     for start in starts:
-        mode = fit_mode(log_density, climb(log_density, start))
+        mode = fit_mode(log_density, climb_on(log_density, start))
         found.append((float(log_density(mode.center)[0]), mode))
     found.sort(key=lambda pair: -pair[0])
 
