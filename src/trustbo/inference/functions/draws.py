@@ -133,7 +133,7 @@ class FunctionDrift:
         if inputs.drift.shape[1:3] != data["awareness"].shape[:2]:
             raise TrustboError(self._wrong_size())
         offset = np.any(inputs.offset)
-        if offset or not np.isfinite(_drift_and_noise(inputs)).all():
+        if offset or not _is_finite(inputs):
             what = "has an offset" if offset else "has a drift or a noise_scale that is not finite"
             raise TrustboError(
                 f"{self.model.in_short()} {what} in some bounds, and such a model cannot plan. "
@@ -181,7 +181,7 @@ class FunctionDrift:
         # The variables of single missions have the same values in all runs.
         data = some._data(z, bounds)
         of_missions = some._drawn_for_mission(data)
-        first, inputs = some._run(data, of_missions)
+        first, inputs = some._run(data, of_missions, N_CHECKED)
         shapes = {name: site.shape for name, site in some.model.sites(data).items()}
         wanted = _drift_and_noise(inputs)[:, 0, : len(z)]
 
@@ -200,7 +200,7 @@ class FunctionDrift:
             name: np.repeat(values, 2, axis=1 + (sites[name].mission_axis or 0))
             for name, values in of_missions.items()
         }
-        second, inputs = some._run(data, twice)
+        second, inputs = some._run(data, twice, N_CHECKED)
         found = _drift_and_noise(inputs).reshape(len(wanted), -1, 2 * self.n_robots)
         found = found[:, : len(order)]
 
@@ -344,3 +344,8 @@ def _by_robot(values: np.ndarray) -> np.ndarray:
 def _drift_and_noise(inputs: Inputs) -> np.ndarray:
     """Return the drift and the scale of the noise along the last axis, 2 for each robot."""
     return np.concatenate([_by_robot(inputs.drift), _by_robot(inputs.noise)], axis=-1)
+
+
+def _is_finite(inputs: Inputs) -> bool:
+    """Return whether the drift and the scale of the noise are finite in all bounds."""
+    return all(bool(np.isfinite(values).all()) for values in (inputs.drift, inputs.noise))
