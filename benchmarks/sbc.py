@@ -22,8 +22,9 @@ from scipy import stats
 from tqdm import tqdm
 
 import trustbo as tb
+from trustbo.inference.class_sampling import by_importance
 from trustbo.inference.class_target import ClassTarget
-from trustbo.inference.classes import OfClass, by_importance
+from trustbo.inference.classes import OfClass
 from trustbo.inference.density import JointDraws
 from trustbo.inference.latent import replicate
 from trustbo.inference.variables import to_variables

@@ -10,8 +10,8 @@ from missions import draw_rates
 from scipy import stats
 
 import trustbo as tb
+from trustbo.inference.class_sampling import by_importance
 from trustbo.inference.class_target import ClassTarget
-from trustbo.inference.classes import by_importance
 from trustbo.models import PlaceEffect, PooledTrust, RobotEffect, TrustParams
 
 FEATURES = ["line_of_sight", "slope"]

@@ -10,7 +10,7 @@ from scipy import special, stats
 import trustbo as tb
 from trustbo.inference import importance
 from trustbo.inference.agreed import Chart, sample_charts
-from trustbo.inference.classes import misses
+from trustbo.inference.class_sampling import misses
 from trustbo.inference.mixture import Mixture
 from trustbo.inference.weights import smoothed
 from trustbo.models import ContactRate, PlaceEffect, PooledTrust
