@@ -62,6 +62,7 @@ REFERENCE = Path(__file__).parent / "reference" / "contact"
 _MOST_DRAWS = 100_000
 """Number of courses that are drawn before a world counts as having too few."""
 _DECIMALS = 4
+_STORED = 3
 
 Course = tuple[Cell, Cell]
 """Start and goal."""
@@ -245,7 +246,7 @@ def write_rows(folder: Path, csv: Path, names: Sequence[str]) -> None:
             if len(rows):
                 csv.mkdir(parents=True, exist_ok=True)
                 name = f"{setting} {method}.csv".replace(", ", "-").replace(" ", "_")
-                write_text(csv / name, rows.to_csv(index=False))
+                write_text(csv / name, rows.round(_STORED).to_csv(index=False))
 
 
 def _try(world: World, *arguments: Any) -> tuple[int, str]:
