@@ -18,23 +18,21 @@ methods or worlds can be added. At the end, the rows of all campaigns are writte
 file for each setting and method (see `rows_in`). `benchmarks/tables.py` summarises them.
 """
 
-import sys
-import time
 import warnings
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 from baselines import line_of_sight, residual_process, running_mean
 from baselines.paths import PathPolicy
 from common import arguments, parsed
-from joblib import Parallel, delayed, parallel_config
+from lost import lost_in
 from threadpoolctl import threadpool_limits
 from world_set import World, worlds
 from world_set.world import drawn
+from worlds_in_parallel import run_worlds
 
 import trustbo as tb
 from trustbo.data import POST_SETS, Cell
@@ -153,14 +151,6 @@ def seed_of(which: str, mission: int) -> int:
     return int(drawn(which, f"mission {mission}").integers(2**31))
 
 
-def lost_in(mission: tb.Mission) -> float:
-    """Return the contact lost in a mission, in bounds; a bound that is not completed counts 1."""
-    done = np.array(mission.bound_status) == "ok"
-    n_planned = len(mission.path) - 1
-    rates = np.nanmean(mission.contact_rate[done], axis=1)
-    return float(n_planned - rates.sum())
-
-
 # --- runs ---
 
 
@@ -226,11 +216,7 @@ def run(given: Namespace) -> None:
 
     methods = given.method or tuple(METHODS)
     shared = methods, given.out, given.setting or tuple(SETTINGS), n_missions
-    with parallel_config("loky", inner_max_num_threads=1):
-        jobs = Parallel(given.jobs, return_as="generator_unordered")(
-            delayed(_try)(world, *shared) for world in some
-        )
-        errors = list(_reported(jobs, len(some)))
+    errors = run_worlds(run_world, some, given.jobs, *shared)
 
     if given.csv is not None:
         write_rows(given.out, given.csv, list(every))
@@ -247,34 +233,6 @@ def write_rows(folder: Path, csv: Path, names: Sequence[str]) -> None:
                 csv.mkdir(parents=True, exist_ok=True)
                 name = f"{setting} {method}.csv".replace(", ", "-").replace(" ", "_")
                 write_text(csv / name, rows.round(_STORED).to_csv(index=False))
-
-
-def _try(world: World, *arguments: Any) -> tuple[int, str]:
-    """Call `run_world`; an error in one world, which is returned, does not stop the others."""
-    try:
-        return run_world(world, *arguments), ""
-    except Exception as error:
-        return 0, f"{world.name}: {type(error).__name__}: {error}"
-
-
-def _reported(jobs: Iterable[tuple[int, str]], n_worlds: int) -> Iterator[str]:
-    """Print the progress and the estimated end after each world; yield the errors."""
-    began = time.time()
-    n_run = 0  # worlds of which some campaign had no file
-    for k, (n_campaigns, error) in enumerate(jobs, start=1):
-        if error:
-            print(error, file=sys.stderr, flush=True)
-            yield error
-        if not n_campaigns:
-            continue
-
-        n_run += 1
-        passed = time.time() - began
-        end = time.localtime(time.time() + passed / n_run * (n_worlds - k))
-        state = f"{k} of {n_worlds} worlds after {passed / 60.0:.0f} min"
-        print(
-            f"{state}, end at about {time.strftime('%d %H:%M', end)}", file=sys.stderr, flush=True
-        )
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ import sys
 import time
 import warnings
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -40,11 +40,11 @@ from baselines import line_of_sight, residual_process, running_mean
 from baselines.paths import PathPolicy
 from common import Table, arguments, parsed, verdict
 from groups import GROUPS, KINDS, clustered, grounds_of, interval
-from joblib import Parallel, delayed, parallel_config
 from lost import LEAST, lost_in
 from threadpoolctl import threadpool_limits
 from world_set import World, worlds
 from world_set.world import drawn
+from worlds_in_parallel import run_worlds
 
 import trustbo as tb
 from trustbo.data import POST_SETS, Cell, Mission
@@ -355,40 +355,10 @@ def run(given: Namespace) -> pd.DataFrame:
         given.out = Path(f"{given.out}-quick")  # its campaigns are shorter
 
     shared = given.method or tuple(METHODS), given.out, given.truths, sets, n_missions
-    with parallel_config("loky", inner_max_num_threads=1):
-        jobs = Parallel(given.jobs, return_as="generator_unordered")(
-            delayed(_try)(world, *shared) for world in some
-        )
-        errors = list(_reported(jobs, len(some)))
+    errors = run_worlds(run_world, some, given.jobs, *shared)
     if errors:
         raise SystemExit("\n".join(["campaigns are missing:", *errors]))
     return rows_in(given.out, [world.name for world in some])
-
-
-def _try(world: World, *arguments: Any) -> tuple[int, str]:
-    """Call `run_world`; an error in one world, which is returned, does not stop the others."""
-    try:
-        return run_world(world, *arguments), ""
-    except Exception as error:
-        return 0, f"{world.name}: {type(error).__name__}: {error}"
-
-
-def _reported(jobs: Iterable[tuple[int, str]], n_worlds: int) -> Iterator[str]:
-    """Print the progress and the estimated end after each world; yield the errors."""
-    began = time.time()
-    n_run = 0  # worlds of which some campaign had no file
-    for k, (n_campaigns, error) in enumerate(jobs, start=1):
-        if error:
-            print(error, file=sys.stderr, flush=True)
-            yield error
-        if not n_campaigns:
-            continue
-
-        n_run += 1
-        passed = time.time() - began
-        end = time.localtime(time.time() + passed / n_run * (n_worlds - k))
-        state = f"{k} of {n_worlds} worlds after {passed / 60.0:.0f} min"
-        print(f"{state}, end at about {time.strftime('%H:%M', end)}", file=sys.stderr, flush=True)
 
 
 # --- tables ---

@@ -132,26 +132,27 @@ def differences(table: pd.DataFrame) -> str:
 
 def means_of_parts(rows: pd.DataFrame) -> str:
     """Return the means of the first mission, and of the last ones, by group."""
-    first = of_worlds(rows, "first")
-    last = of_worlds(rows, "last")
-    methods = [name for name in METHODS if name in first]
-    found = []
-    for (name, one), (_, other) in zip(groups_in(first), groups_in(last), strict=True):
-        cells = [f"{number(one[m].mean())}, {number(other[m].mean())}" for m in methods]
-        found.append([f"{name} ({len(one)})", *cells])
-    return markdown([f"first, last {_LAST}", *methods], found)
+    cell = lambda first, last: f"{number(first)}, {number(last)}"  # noqa: E731
+    return pairs(rows, "first", "last", f"first, last {_LAST}", cell)
 
 
 def arrivals(rows: pd.DataFrame) -> str:
     """Return the shares of missions that arrive, of the first ones and of all, by group."""
-    every = of_worlds(rows, "arrive")
-    first = of_worlds(rows, "arrive_first")
-    methods = [name for name in METHODS if name in every]
+    cell = lambda first, every: f"{first:.0%}, {every:.1%}"  # noqa: E731
+    return pairs(rows, "arrive_first", "arrive", "first, all", cell)
+
+
+def pairs(
+    rows: pd.DataFrame, one: str, other: str, title: str, cell: Callable[[float, float], str]
+) -> str:
+    """Return the means of two quantities by group, with a column for each method."""
+    tables = of_worlds(rows, one), of_worlds(rows, other)
+    methods = [name for name in METHODS if name in tables[0]]
     found = []
-    for (name, one), (_, other) in zip(groups_in(first), groups_in(every), strict=True):
-        cells = [f"{one[m].mean():.0%}, {other[m].mean():.1%}" for m in methods]
-        found.append([f"{name} ({len(one)})", *cells])
-    return markdown(["first, all", *methods], found)
+    for (name, first), (_, second) in zip(*map(groups_in, tables), strict=True):
+        cells = [cell(first[m].mean(), second[m].mean()) for m in methods]
+        found.append([f"{name} ({len(first)})", *cells])
+    return markdown([title, *methods], found)
 
 
 def number(value: float) -> str:

@@ -10,7 +10,7 @@ from trustbo.inference.class_target import ClassTarget
 from trustbo.inference.density import Coefficients, JointDraws
 from trustbo.inference.importance import ROUNDS, SIZE, Points, Sampled, sample
 from trustbo.inference.mixture import Mixture
-from trustbo.inference.modes import LogDensity, at_modes, climb_on
+from trustbo.inference.modes import LogDensity, at_modes, climb_on, fit_mode
 from trustbo.inference.weights import MAX_KHAT
 
 _NEGLIGIBLE = 0.01
@@ -112,7 +112,7 @@ def _elsewhere(target: ClassTarget, found: Sampled) -> Elsewhere | None:
     mode = climb_on(target.log_density, target.start())
     if not misses(found, target.log_density, mode):
         return None
-    parts = [found.proposal, at_modes(target.log_density, mode[None])]
+    parts = [found.proposal, fit_mode(target.log_density, mode)]
     return Elsewhere(Mixture.joined(parts, np.full(len(parts), 1.0 / len(parts))))
 
 

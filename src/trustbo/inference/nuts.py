@@ -280,7 +280,7 @@ def sample_by_nuts(
     """Sample the posterior of a model class.
 
     Args:
-        target: ClassTarget of a model given missions.
+        target: Posterior of a model given missions.
         chains: Number of chains.
         draws: Number of draws per chain.
         warmup: Number of warm-up draws per chain. The default is 150 for Gaussian rates, for which
