@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from trustbo.terrain.examples import EXAMPLE_FILES
 
 mpl.use("Agg")
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 

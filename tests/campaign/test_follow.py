@@ -384,3 +384,18 @@ def test_a_tick_that_names_its_robots_is_read_by_name():
     follower.end(5.0)
     np.testing.assert_array_equal(follower.bounds[0].contact_rate, [0.0, 0.0, 1.0])
     np.testing.assert_array_equal(follower.bounds[0].n_ticks, [2.0, 3.0, 3.0])
+
+
+def test_a_follower_says_if_trust_rests_on_few_draws():
+    campaign = begun(n_missions=2)
+    follower = tb.Follower(campaign)
+    assert "effective" not in str(follower)
+
+    n_bounds = len(follower.path) - 1
+    lost = np.zeros((n_bounds, 400, 3))  # no contact, of which the posterior knows nothing
+    for _ in follow(follower, lost):
+        pass
+    kept = follower._now.weights
+    assert follower._now.kish == pytest.approx(1.0 / np.sum(kept**2))
+    assert ("effective" in str(follower)) == (follower._now.kish < 20.0)
+    assert follower._now.kish < 20.0

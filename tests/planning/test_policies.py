@@ -125,6 +125,8 @@ def test_random_paths_ignore_what_was_learned_and_keep_the_limit(workspace):
     ]
     assert paths[0] == paths[1]
     assert len(set(paths[0])) > 10
+    at_goal = Planner(workspace, *ENDS, "terminal")  # all bounds count, not the last one alone
+    assert len({policies.random(rng(k), prior_draws(), at_goal).path for k in range(30)}) > 10
     p_fail = rng(1).uniform(0.0, 0.25, (8, 4, 4))
     limited = Planner(workspace, *ENDS, "terminal", max_failure=0.45).with_risk(p_fail)
     plans = [policies.random(rng(seed), prior_draws(), limited) for seed in range(20)]

@@ -18,7 +18,7 @@ from trustbo.errors import TrustboError
 from trustbo.identity import fingerprint
 from trustbo.models.backend import VERSIONS
 from trustbo.simulation import Truth
-from trustbo.study import Scene, run_grid
+from trustbo.study import Scene, lost_in, run_grid
 from trustbo.study.grid import _PARTS as PARTS
 
 POOLED = tb.models.PooledTrust()
@@ -399,3 +399,39 @@ def test_names_and_seeds_that_are_unclear_are_refused(cases, seeds, tmp_path):
     with pytest.raises(TrustboError):
         run_grid(cases, SCENES, tmp_path, seeds=seeds, n_missions=1, n_jobs=1)
     assert not list(tmp_path.iterdir())
+
+
+def test_contact_lost_counts_what_was_not_completed_as_lost():
+    path = [(0, 0), (0, 1), (0, 2), (0, 3), (0, 4)]
+    rates = np.array([[0.5, 0.7], [np.nan, np.nan], [0.9, np.nan], [1.0, 1.0]])
+    awareness = np.zeros((4, 2, 1))
+
+    whole = tb.Mission.from_arrays(path, awareness, rates)
+    assert lost_in(whole) == pytest.approx(0.4 + (1.0 - 2.5 / 3.0) + 0.1 + 0.0)
+
+    failed = tb.Mission.from_arrays(path, awareness[:3], rates[:3], status="stuck")
+    assert failed.bound_status == ("ok", "ok", "stuck")
+    assert lost_in(failed) == pytest.approx(0.4 + 0.4 + 1.0 + 1.0)
+
+    unknown = tb.Mission.from_arrays(path, awareness, np.full((4, 2), np.nan))
+    assert np.isnan(lost_in(unknown))
+
+
+def test_a_policy_of_its_own_runs_on_changing_courses_without_a_truth(tmp_path):
+    courses = (((2, 0), (0, 2)), ((0, 0), (2, 2)))
+    where = SCENES["made 0"]()._replace(start=None, goal=None, courses=courses)
+
+    class Own:
+        def __call__(self, rng, draws, planner):
+            return planner.plan(draws)
+
+        def recommend(self, campaign):
+            return campaign.planner.plan(campaign.belief).path
+
+    cases = {"own": {"model": POOLED, "policy": Own()}}
+    table = run_grid(cases, {"made": lambda: where._replace(truth=None)}, tmp_path, seeds=1,
+                     n_missions=3, n_jobs=1)  # fmt: skip
+    assert "regret" not in table
+    assert table["measured"].notna().sum() == 3
+    with pytest.raises(TrustboError, match="one course, or without a truth"):
+        run_grid(cases, {"made": lambda: where}, tmp_path / "truth", n_missions=1, n_jobs=1)

@@ -33,6 +33,9 @@ from trustbo.inference.filter import TrustForecast, TrustState
 from trustbo.planning import Plan
 from trustbo.workspace.grid import Location
 
+_FEW = 20
+"""Effective number of draws below which the summary of a follower says how many there are."""
+
 
 class Follower(Summary):
     """Follows a mission of a campaign bound by bound and tick by tick.
@@ -45,7 +48,8 @@ class Follower(Summary):
 
     Attributes:
         bounds: Bounds that have ended.
-        trust: Current trust, shapes (robot,); during a bound, the trust if the bound ended now.
+        trust: Current trust, shapes (robot,); during a bound, the trust if the bound ended now. If
+            the rates surprise the posterior, it rests on few draws, as `print(follower)` shows.
         running: Whether a bound is in progress.
 
     Example:
@@ -98,12 +102,16 @@ class Follower(Summary):
         if self._is_over:
             doing = f"over after {path_text([here])}: {self.bounds[-1].status}"
         trust = zip(self._workspace.team.names, self.trust.mean, self.trust.sd, strict=True)
-        return [
+        rows = [
             ("path", path_text(self.path)),
             ("bounds", f"{len(self.bounds)} ended, {len(planned)} planned"),
             ("lead", doing),
             ("trust", ", ".join(f"{name} {mean:.2f} ± {sd:.2f}" for name, mean, sd in trust)),
         ]
+        kish, n_draws = self._now.kish, len(self._now.weights)
+        if kish < min(_FEW, n_draws):
+            rows.append(("draws", f"{kish:.0f} of {n_draws} are effective, so trust is inexact"))
+        return rows
 
     @property
     def rest(self) -> tuple[Cell, ...]:

@@ -48,8 +48,8 @@ That of a data sheet is calibrated by the first plans of `benchmarks/arrivals.py
 class Hazard:
     """Priors on the probability that a bound ends the mission; normal priors are (mean, sd) pairs.
 
-    By default, the stated slope limit is accurate to within half a degree with probability .6, and
-    wrong by about 3 degrees with probability .4.
+    By default, the stated slope limit has an error with an sd of half a degree with probability .6,
+    and with an sd of 3 degrees with probability .4.
 
     Attributes:
         intercept: Prior on the logit of the mean failure probability at medium difficulty.

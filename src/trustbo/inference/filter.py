@@ -160,6 +160,15 @@ class TrustFilter:
         self.n_bounds = 0
 
     @property
+    def kish(self) -> float:
+        """Effective number of draws, 1 / sum(weights^2).
+
+        It falls if rates surprise the posterior. If only a few draws are left, trust has a large
+        Monte Carlo error.
+        """
+        return float(1.0 / (self.weights**2).sum())
+
+    @property
     def state(self) -> TrustState:
         """Trust of each robot after the bounds so far."""
         return _average(self._belief, self.weights)

@@ -86,7 +86,7 @@ def fit(
         progress: Whether to show a progress bar; importance sampling shows it after 1.5 seconds.
         check: Whether to raise an error if the diagnostics are bad. For importance sampling, this
             means k-hat > 0.7; for NUTS, R-hat > 1.01, bulk ESS < 400 or any divergence. The limits
-            for NumPyro functions are different; see the how-to "Your own model".
+            for NumPyro functions are different; see the page "Inference".
         latent: Whether to add latent trust, log-likelihoods and predictions, as `add_latent` does.
         start: Posterior of the same model given similar data, such as all missions but the last.
             Importance sampling then begins with the proposal of this posterior instead of a search

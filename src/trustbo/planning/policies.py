@@ -143,7 +143,10 @@ def explore(
 
 
 def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
-    """Plan the best path for random drifts, which are uniform on [0, 1]; ignore the posterior.
+    """Plan the best path for random drifts; ignore the posterior.
+
+    Drifts are uniform on [0, 1] and not carried over. For the objective `"terminal"`, which would
+    then be about the last bound alone, they are uniform on [-1/2, 1/2] and add up along the path.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -153,9 +156,10 @@ def random(rng: np.random.Generator, params: Draws, planner: Planner) -> Plan:
 
     paths = planner.problem.paths
     shape = paths.bounds.shape if paths.workspace.n_posts == 1 else paths.pairs.shape[:1]
+    at_goal = planner.problem.objective.name == "terminal"
     recursion = Recursion(
-        transition=np.zeros((1, 1, 1)),
-        drift=rng.uniform(size=(1, 1, *shape)),
+        transition=np.full((1, 1, 1), float(at_goal)),
+        drift=rng.uniform(size=(1, 1, *shape)) - 0.5 * at_goal,
         start=np.zeros((1, 1)),
         noise_sd=np.full(1, 0.1),  # matters only for censored rates
         likelihood=params.likelihood,

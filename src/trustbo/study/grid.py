@@ -11,6 +11,7 @@ from pathlib import Path
 from pickle import PicklingError
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 from joblib import Parallel, delayed
 from joblib.externals.loky import get_reusable_executor
@@ -18,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from trustbo.campaign.campaign import Campaign
 from trustbo.campaign.result import Result
-from trustbo.data import Cell
+from trustbo.data import Cell, Mission
 from trustbo.errors import (
     TrustboError,
     composed,
@@ -127,11 +128,12 @@ def run_grid(
         One row per run and mission, with `case`, `scene`, `seed`, the labels of the scene, and
         `mission`, which is 0 before the first mission. `regret` (%) and `lost` (bounds) describe
         the path recommended after the mission, and `best` is the loss on the best path, all in the
-        world of the next mission (see `Truth`). `status` and mean `contact_rate` describe the
-        mission itself. `driven` and `best_driven` are the expected losses on the driven path and on
-        the best path. `failed_driven` is the difference of these losses if bounds that fail or are
-        not reached count as fully lost. `seconds` is the CPU time of planning, simulating and
-        learning, without the evaluation of the paths.
+        world of the next mission (see `Truth`). `status`, mean `contact_rate` and `measured`, the
+        contact lost (see `lost_in`), describe the mission itself. `driven` and `best_driven` are
+        the expected losses on the driven path and on the best path. `failed_driven` is the
+        difference of these losses if bounds that fail or are not reached count as fully lost.
+        `seconds` is the CPU time of planning, simulating and learning, without the evaluation of
+        the paths. Scenes without a truth lack the columns that need it.
 
     Raises:
         TrustboError: A run failed (call the function again to repeat failed runs), a stored run is
@@ -271,26 +273,48 @@ def _rows(
     ground = (scene.workspace, *ends)
     with Campaign(*ground, seed=seed, directory=None, overwrite=False, **options) as campaign:
         policy: Any = campaign.policy
-        yield {"mission": 0, **_recommended(_path_of(campaign, scene, 0), scene, 0)}
+        yield {"mission": 0, **_recommended(campaign, scene, 0)}
 
         began = time.process_time()
         steps = campaign.run(scene.simulator, n_missions, courses=scene.courses or None)
         for number, (_, mission) in enumerate(steps, start=1):
             if hasattr(policy, "learn"):
                 policy.learn(campaign, mission)
-            path = _path_of(campaign, scene, number)
             seconds = time.process_time() - began
 
             contact_rate = campaign.state.entries[-1].measures["contact_rate"]
             yield {
                 "mission": number,
-                **_recommended(path, scene, number),
+                **_recommended(campaign, scene, number),
                 "status": mission.status,
                 "contact_rate": contact_rate,
+                "measured": lost_in(mission),
                 **_driven(mission.stations, scene, number - 1),
                 "seconds": seconds,
             }
             began = time.process_time()
+
+
+def lost_in(mission: Mission) -> float:
+    """Return the contact lost in a mission as it was measured, in bounds.
+
+    A bound that was completed loses 1 minus the mean contact rate of the measured robots; without
+    any rate, it counts as the mean of the others. A bound that failed or was not reached loses 1.
+    If no rate is known, the result is NaN.
+
+    Example:
+        >>> lost = [tb.study.lost_in(mission) for mission in result.missions]
+    """
+    done = np.array(mission.bound_status) == "ok"
+    is_measured = done & np.isfinite(mission.contact_rate).any(axis=1)
+    if not done.any():
+        return float(len(mission.path) - 1)
+    if not is_measured.any():
+        return np.nan
+
+    rates = np.nanmean(mission.contact_rate[is_measured], axis=1)
+    n_unknown = int((done & ~is_measured).sum())
+    return float(len(mission.path) - 1 - rates.sum() - n_unknown * rates.mean())
 
 
 def _path_of(campaign: Campaign, scene: Scene, mission: int) -> Sequence[Cell]:
@@ -299,15 +323,18 @@ def _path_of(campaign: Campaign, scene: Scene, mission: int) -> Sequence[Cell]:
     if choose is None:
         return campaign.recommend(*scene.ends(mission)).stations
     if scene.courses:
-        raise TrustboError("a policy with a method recommend needs a scene with one course.")
+        raise TrustboError(
+            "a policy with a method recommend needs a scene with one course, or without a truth."
+        )
     return choose(campaign)
 
 
-def _recommended(path: Sequence[Cell], scene: Scene, mission: int) -> dict[str, float]:
+def _recommended(campaign: Campaign, scene: Scene, mission: int) -> dict[str, float]:
     """Compute regret and loss of the path recommended before `mission`, an index from 0."""
     if scene.truth is None:
         return {}
 
+    path = _path_of(campaign, scene, mission)
     truth = scene.truth.at(mission)
     best = truth.best(*scene.ends(mission), **scene.judged)
     regret = truth.regret(path, **scene.judged)
