@@ -23,7 +23,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from common import arguments, parsed
+from common import Table, arguments, parsed
+from groups import interval
 from scipy import stats
 from world_set import COURSES, World, worlds
 
@@ -57,7 +58,7 @@ def main():
             if not file.exists():
                 compare(*make(), model, after, seed).to_csv(file, index=False)
             rows.append(pd.read_csv(file).assign(world=label, seed=seed))
-        report(title, pd.concat(rows))
+        report(name, title, pd.concat(rows))
 
 
 def scenes(data: Path | None, n: int, options: dict[str, Any]) -> Iterator[tuple[str, Any, int]]:
@@ -88,7 +89,7 @@ def scene_of(world: World, options: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def paper_scene(options: dict[str, Any]) -> tuple[Any, ...]:
-    """Make the simulator of notebooks/paper_experiment.ipynb, with its start and goal."""
+    """Make the simulator of notebooks/2_paper_experiment.ipynb, with its start and goal."""
     terrain = tb.terrain.synthetic_terrain((500.0, 500.0), 1.0, seed=2)
     workspace = tb.Workspace.from_terrain(terrain, (10, 10), tb.Team(3), **options)
     return tb.simulation.KinematicSimulator(workspace), (9, 0), (0, 9)
@@ -129,28 +130,25 @@ def compare(
     return pd.DataFrame(rows)
 
 
-def report(title: str, rows: pd.DataFrame) -> None:
+def report(name: str, title: str, rows: pd.DataFrame) -> None:
     """Print the mean log score of each source, and its difference from the map's."""
+    print(f"\n**{title}**\n")
+    table = Table(
+        "next mission", "awareness", "log score per rate, nats", "minus the map's [95 %]",
+        "better in", name=f"awareness_{name}",
+    )  # fmt: skip
     for what, some in (
         ("worlds", rows[rows["world"] != PAPER]),
         (PAPER, rows[rows["world"] == PAPER]),
     ):
         by = some.groupby(["world", "seed", "awareness"])["mean_log_score"].mean().unstack()
-        print(f"\n**{title}**, {what} ({len(by)} pairs)\n")
-        print("| awareness | log score per rate, nats | minus the map's [95 %] | worlds better |")
-        print("| --- | --- | --- | --- |")
         for rival in RIVALS:
-            difference = by[rival] - by[RIVALS[0]]
-            line = f"| {rival} | {by[rival].mean():.3f} |"
-            if rival == RIVALS[0]:
-                print(f"{line} | |")
-                continue
-            half = stats.t.ppf(0.975, len(by) - 1) * difference.sem()
-            mean = difference.mean()
-            print(
-                f"{line} {mean:+.3f} [{mean - half:+.3f}, {mean + half:+.3f}] "
-                f"| {int((difference > 0.0).sum())} of {len(by)} |"
-            )
+            less = by[rival] - by[RIVALS[0]]
+            mean = less.mean()
+            half = stats.t.ppf(0.975, len(by) - 1) * less.sem()
+            cells = interval(mean, mean - half, mean + half), f"{(less > 0.0).sum()} of {len(by)}"
+            is_map = rival == RIVALS[0]
+            table.row(what, rival, f"{by[rival].mean():.3f}", *(("", "") if is_map else cells))
 
 
 if __name__ == "__main__":

@@ -1,19 +1,17 @@
-"""Measure how certain fitted models are, and how certain they should be (docs/benchmarks.md).
+"""Measure how certain fitted models are, and how certain they should be.
 
-    python benchmarks/calibration.py --data DIR --out out/calibration --csv out/calibration.csv
-    python benchmarks/calibration.py --model default --model other    # paired differences
-    python benchmarks/calibration.py --compare benchmarks/reference/calibration_0.5.csv
-    python benchmarks/calibration.py --rows out/calibration.csv    # of an earlier run
+    python benchmarks/calibration.py --data DIR --csv out/calibration.csv
     python benchmarks/calibration.py --paths --data DIR               # drive the paths anew
 
 The data do not depend on the model. In each world and on two courses, ten missions follow the paths
-that the default campaign of version 0.5 took. These paths and the seeds of their simulation are
-stored in reference/calibration_paths.csv. Each model is fitted to the ten missions. Its trust in
-each robot, with the robots' effects in the next mission drawn, and its predicted rates are compared
-with simulated rates of the next mission:
+that a default campaign took. These paths, with the sets of posts, and the seeds of their simulation
+are stored in reference/calibration_paths.csv. Each model is fitted to the ten missions. Its trust
+in each robot, with the robots' effects in the next mission drawn, and its predicted rates are
+compared with simulated rates of the next mission:
 
 - driven: 24 replicates of the path of the last mission.
-- undriven: 8 replicates of each of six random paths, only bounds that are on none of the ten paths.
+- undriven: 8 replicates of each of six random paths, only bounds that are on none of the ten paths,
+  watched from any set of posts.
 
 A true rate is the mean over the replicates that complete the bound, at least half of them. It has a
 Monte Carlo error of its own, which is not removed. `trust50` and `trust90` are the shares of true
@@ -28,8 +26,7 @@ Before any mission, `prior_in_range` is the share of prior predictive rates alon
 path that lie in [0, 1]. `plan90` states whether the 90 % band of the first plan's value holds the
 contact lost in replicates of its path, and `plan_width` is the width of the band, in bounds.
 
-With `--compare`, only the worlds in its file are compared. Of the worlds above, synthetic-1-radio
-is not in calibration_0.5.csv, because its field has changed since then.
+Intervals of differences between models are those of a t test clustered by terrain.
 
 Simulated missions are kept in --out, so later runs only fit. Delete this folder if a simulator, a
 workspace or the stored paths have changed.
@@ -46,43 +43,22 @@ import joblib
 import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
-from groups import ALIKE, grounds_of, interval
+from groups import ALIKE, interval, over_worlds
 from scipy.special import ndtr
-from summary import bootstrap
 from world_set import World, worlds
 
 import trustbo as tb
-from trustbo.data import Cell
+from trustbo.data import POST_SETS, Station
+from trustbo.files import write_text
 from trustbo.models.draws import Draws
 from trustbo.planning.recursion import trust_recursion
 from trustbo.workspace.moves import MOVE_NAMES, MOVES, bounds_along, moves_along
 
-
-def as_in_0_5(**changes: Any) -> Callable[[Sequence[str]], tb.models.PooledTrust]:
-    """Return the default model of version 0.5 for some features, with changed settings of effects.
-
-    Each change is a setting of an effect, or `f_v`.
-    """
-
-    def model(features: Sequence[str]) -> tb.models.PooledTrust:
-        settings = {"f_e": 1.0, "tau_lasting": 0.0, "f_v": None} | changes
-        priors = replace(tb.models.Priors.from_features(features), f_v=settings["f_v"])
-        places = tb.models.PlaceEffect(f_e=settings["f_e"])
-        robots = tb.models.RobotEffect(tau_lasting=settings["tau_lasting"])
-        return tb.models.PooledTrust(priors, effects=[places, robots])
-
-    return model
-
-
-_FLOOR = tb.models.Priors.from_features(["line_of_sight"]).f_v
-MODELS: dict[str, Any] = {
-    "default": lambda features: tb.models.default_model(),
-    "as in 0.5": as_in_0_5(),
-    "scales": as_in_0_5(f_e=0.02, f_v=_FLOOR),
-    "scale of effects": as_in_0_5(f_e=0.02),
-    "lasting part": as_in_0_5(tau_lasting=0.3),
+MODELS: dict[str, Callable[[], Any]] = {
+    "default": tb.models.default_model,
+    "without effects": tb.models.PooledTrust,
 }
-"""Models that can be compared for given features, keyed by name."""
+"""Makes the models that are compared; the second one has the features of the first alone."""
 WORLDS = (
     "synthetic-1", "wellington", "topography", "synthetic-0-wall", "bcts-bare",
     "synthetic-0-aged", "bcts-aged", "tahoe-aged",
@@ -100,7 +76,6 @@ COURSES = ("sw-ne", "nw-se")
 MISSIONS = 10
 """Number of missions to which models are fitted; those of held-out data have this number."""
 PATHS = Path(__file__).parent / "reference" / "calibration_paths.csv"
-PLANNER = {"max_bounds": "shortest+4"}
 N_RANDOM = 6
 N_OF_RANDOM = 8
 """Number of replicates of each random path."""
@@ -151,32 +126,21 @@ def main() -> None:
     parser = arguments(
         __doc__ or "", data=True, out="out/calibration", quick="two small worlds, one course"
     )
-    parser.add_argument("--model", action="append", choices=MODELS, help="default: default")
-    parser.add_argument("--world", action="append", choices=WORLDS, help="world (default all)")
     parser.add_argument("--csv", type=Path, help="CSV file for the rows")
-    parser.add_argument("--rows", type=Path, help="CSV file with rows, instead of fits")
-    parser.add_argument("--compare", type=Path, help="CSV file with rows of the first model")
     parser.add_argument("--paths", action="store_true", help="compute the stored paths anew")
     given = parsed(parser)
 
-    names = SMALL if given.quick else given.world or WORLDS
     courses = COURSES[:1] if given.quick else COURSES
     every = worlds(given.data)
+    names = SMALL if given.quick else WORLDS
     chosen = [every[name] for name in names if given.data or every[name].is_packaged]
     if given.paths:
         store_paths(chosen, courses)
         return
 
-    models = {name: MODELS[name] for name in given.model or ["default"]}
-    if given.rows is None:
-        rows = measure(chosen, courses, models, given.out)
-    else:
-        rows = rows_in(given.rows)
+    rows = measure(chosen, courses, MODELS, given.out)
     if given.csv is not None:
-        given.csv.parent.mkdir(parents=True, exist_ok=True)
-        rows.round(4).to_csv(given.csv, index=False)
-    if given.compare is not None:
-        rows = with_stored(given.compare, rows)
+        write_text(given.csv, rows.round(4).to_csv(index=False))
     report(rows)
 
 
@@ -185,13 +149,9 @@ def rows_in(file: Path) -> pd.DataFrame:
     return pd.read_csv(file, dtype={"stratum": str})
 
 
-def with_stored(file: Path, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of a file, named after it, and those given, of the worlds in both."""
-    stored = rows_in(file)
-    before = stored.assign(model=stored["model"] + f" ({file.stem})")
-    scenes = ["world", "course"]
-    both = stored[scenes].drop_duplicates().merge(rows[scenes].drop_duplicates())
-    return pd.concat([before.merge(both), rows.merge(both)])
+def workspace_of(world: World) -> tb.Workspace:
+    """Return the assumed workspace of a world, with the default number of sets of posts."""
+    return world.workspace(n_posts=len(POST_SETS))
 
 
 # --- paths ---
@@ -209,19 +169,19 @@ def store_paths(chosen: Sequence[World], courses: Sequence[str]) -> None:
 
 def paths_of(world: World, course: str) -> list[dict[str, Any]]:
     """Run the default campaign of a world and course; return the rows of its paths."""
-    workspace = world.workspace()
+    workspace = workspace_of(world)
     simulator = world.simulator(workspace)
-    campaign = tb.Campaign(workspace, *world.ends(course), seed=0, planner=PLANNER)
+    campaign = tb.Campaign(workspace, *world.ends(course), seed=0)
     rng = np.random.default_rng(0)
     random = [
-        tb.planning.policies.random(rng, campaign.belief, campaign.planner).path
+        tb.planning.policies.random(rng, campaign.belief, campaign.planner).stations
         for _ in range(N_RANDOM)
     ]
 
     for _ in campaign.run(simulator, MISSIONS):
         pass
     driven = [
-        (str(j), campaign.state.seed_of("mission", j), mission.path)
+        (str(j), campaign.state.seed_of("mission", j), mission.stations)
         for j, mission in enumerate(campaign.missions)
     ]
     others = [(f"random-{k}", SEEDS["random"] + 100 * k, path) for k, path in enumerate(random)]
@@ -233,18 +193,28 @@ def paths_of(world: World, course: str) -> list[dict[str, Any]]:
     ]
 
 
-def text_of(path: Sequence[Cell]) -> str:
-    """Write a path as its first cell and the directions of its bounds, such as "9,0 n ne"."""
-    row, col = path[0]
-    return " ".join([f"{row},{col}", *(MOVE_NAMES[move] for move in moves_along(path))])
+def text_of(path: Sequence[Station]) -> str:
+    """Write a path as its first cell, directions, and sets of posts, such as "9,0 n ne@far".
+
+    The first set of posts has no name.
+    """
+    row, col = path[0][:2]
+    names = [MOVE_NAMES[move] for move in moves_along(path)]
+    sets = ["".join(f"@{name}" for name in station[2:]) for station in path[:-1]]
+    return " ".join([f"{row},{col}", *map(str.__add__, names, sets)])
 
 
-def path_of(text: str) -> list[Cell]:
+def path_of(text: str) -> list[Station]:
     """Read a path that `text_of` wrote."""
-    first, *names = text.split()
+    first, *steps = text.split()
     row, col = map(int, first.split(","))
-    steps = [(row, col), *(MOVES[MOVE_NAMES.index(name)] for name in names)]
-    return [(int(row), int(col)) for row, col in np.cumsum(steps, axis=0)]
+    found: list[Station] = []
+    for step in steps:
+        name, _, posts = step.partition("@")
+        found.append((row, col, posts) if posts else (row, col))
+        down, right = MOVES[MOVE_NAMES.index(name)]
+        row, col = row + down, col + right
+    return [*found, (row, col)]
 
 
 # --- simulated data ---
@@ -264,15 +234,15 @@ def data_of(world: World, course: str, folder: Path) -> Data:
     }
     seeds = dict(zip(stored["mission"], stored["seed"], strict=True))
 
-    simulator = world.simulator(world.workspace())
+    simulator = world.simulator(workspace_of(world))
     missions = [
         without_ticks(simulator.run(paths[f"{j}"], seed=int(seeds[f"{j}"]), mission=j))
         for j in range(MISSIONS)
     ]
-    driven = {tuple(b) for m in missions for b in bounds_along(m.path)[: len(m.contact_rate)]}
-    planned = {tuple(bound) for mission in missions for bound in bounds_along(mission.path)}
+    driven = {tuple(b) for m in missions for b in bounds_along(m.driven_stations)}
+    planned = {bound for mission in missions for bound in moves_of(bounds_along(mission.path))}
 
-    last = replicates(simulator, missions[-1].path, N_OF_PLANNED, SEEDS["driven"], MISSIONS)
+    last = replicates(simulator, missions[-1].stations, N_OF_PLANNED, SEEDS["driven"], MISSIONS)
     random = [
         replicates(simulator, path, N_OF_RANDOM, int(seeds[name]), MISSIONS)
         for name, path in paths.items()
@@ -285,7 +255,9 @@ def data_of(world: World, course: str, folder: Path) -> Data:
     )
     sets = {
         "driven": selected(last, [tuple(bound) in driven for bound in last.bounds]),
-        "undriven": selected(undriven, [tuple(bound) not in planned for bound in undriven.bounds]),
+        "undriven": selected(
+            undriven, [bound not in planned for bound in moves_of(undriven.bounds)]
+        ),
     }
     folder.mkdir(parents=True, exist_ok=True)
     # Plain tuples can be read by any process; classes of a script belong to `__main__`.
@@ -293,12 +265,17 @@ def data_of(world: World, course: str, folder: Path) -> Data:
     return Data(missions, sets)
 
 
+def moves_of(bounds: np.ndarray) -> list[tuple[int, ...]]:
+    """Return the moves, rows and columns of bounds, from whichever set of posts."""
+    return [(int(way) % len(MOVES), int(row), int(col)) for way, row, col in bounds]
+
+
 def without_ticks(mission: tb.Mission) -> tb.Mission:
     """Leave out what no model is fitted to, which would need most of the disk space."""
     return replace(mission, poses=(), contact=())
 
 
-def replicates(simulator: Any, path: Sequence[Cell], n: int, seed: int, mission: int) -> HeldOut:
+def replicates(simulator: Any, path: Sequence[Station], n: int, seed: int, mission: int) -> HeldOut:
     """Simulate a path n times."""
     bounds = bounds_along(path)
     shape = (n, len(bounds), len(simulator.workspace.team.names))
@@ -319,13 +296,13 @@ def selected(data: HeldOut, where: Sequence[bool]) -> HeldOut:
     return HeldOut(data.bounds[kept], data.rates[:, kept], data.n_ticks[:, kept])
 
 
-def lost_on(world: World, course: str, path: Sequence[Cell], folder: Path) -> float:
+def lost_on(world: World, course: str, path: Sequence[Station], folder: Path) -> float:
     """Return the mean contact lost on a path in the first mission, in bounds, if no bound fails."""
     file = folder / f"{world.name}~{course}~first.pkl"
     known = joblib.load(file) if file.exists() else {}
     text = text_of(path)
     if text not in known:
-        simulator = world.simulator(world.workspace())
+        simulator = world.simulator(workspace_of(world))
         runs = replicates(simulator, path, N_OF_PLANNED, SEEDS["first"], 0)
         n_done = np.isfinite(runs.rates).sum(0)
         mean = np.nansum(runs.rates, axis=0) / np.where(n_done, n_done, np.nan)
@@ -346,9 +323,9 @@ def measure(
     for world in chosen:
         for course in courses:
             data = data_of(world, course, folder)
-            features = world.workspace().features  # is kept, and not part of the time of fits
+            workspace_of(world)  # is kept, and not part of the time of fits
             for name, make in models.items():
-                model = make(features)
+                model = make()
                 started = time.process_time()
                 found = [
                     *rows_of_fit(world, data, model),
@@ -364,7 +341,7 @@ def measure(
 
 def rows_of_fit(world: World, data: Data, model: Any) -> list[dict[str, Any]]:
     """Fit a model, and return its rows for each set and stratum."""
-    workspace = world.workspace()
+    workspace = workspace_of(world)
     posterior = tb.fit(
         data.missions, model, workspace=workspace, seed=1, latent=False, progress=False
     )
@@ -409,14 +386,14 @@ def poor_robots(world: World) -> list[int]:
 
 def rows_before(world: World, course: str, model: Any, folder: Path) -> list[dict[str, Any]]:
     """Return the row of measures before any mission."""
-    workspace = world.workspace()
-    campaign = tb.Campaign(workspace, *world.ends(course), model=model, seed=0, planner=PLANNER)
+    workspace = workspace_of(world)
+    campaign = tb.Campaign(workspace, *world.ends(course), model=model, seed=0)
     plan = campaign.ask()
-    lost = lost_on(world, course, plan.path, folder)
+    lost = lost_on(world, course, plan.stations, folder)
     low, high = plan.value_band or (np.nan, np.nan)
 
-    awareness = workspace.along(plan.path)
-    trust = tb.planning.expected_trust(campaign.forecast, awareness, path=plan.path)
+    awareness = workspace.along(plan.stations)
+    trust = tb.planning.expected_trust(campaign.forecast, awareness, path=plan.stations)
     trust = np.swapaxes(trust, 1, 2)  # (draw, robot, bound)
     sd = noise_of(campaign.forecast, np.swapaxes(awareness, 0, 1))
     rates = trust + sd * np.random.default_rng(0).standard_normal(trust.shape)
@@ -547,8 +524,6 @@ def report(rows: pd.DataFrame) -> None:
     for name, some in learned[learned["stratum"] == "all"].groupby("set", sort=False):
         print(f"\n**{name}**, by group of kinds\n")
         print_means(some, ["group"], models)
-        print(f"\n**{name}**, by world\n")
-        print_means(some, ["world"], models)
 
     before = found[found["set"] == FIRST]
     print("\n**Before any mission**: prior predictive rates, and the first plan's band\n")
@@ -562,9 +537,10 @@ def report(rows: pd.DataFrame) -> None:
                 means = some[OF_PRIOR].mean()
                 table.row(group, model, len(some), *(f"{mean:.3f}" for mean in means))
 
-    for model in models[1:]:
-        print(f"\n**{model} minus {models[0]}**, same worlds [95 % by terrain]\n")
-        print_differences(learned, models[0], model)
+    first, *others = models
+    for model in others:
+        print(f"\n**{first} minus {model}**, same worlds\n")
+        print_differences(learned, first, model)
 
 
 def print_means(found: pd.DataFrame, by: list[str], models: Sequence[str]) -> None:
@@ -579,12 +555,12 @@ def print_means(found: pd.DataFrame, by: list[str], models: Sequence[str]) -> No
 
 
 def print_differences(found: pd.DataFrame, first: str, second: str) -> None:
-    """Print the mean differences over worlds of two models, by set and by stratum or group."""
+    """Print the means over worlds of one model minus another, by set and by stratum or group."""
     names = [name for name in OF_TRUST if name != "poor_bias"]
     table = Table("set", "rates", "worlds", *names)
     keys = ["set", "stratum", "group", "world"]
     pair = [found[found["model"] == model].set_index(keys)[names] for model in (first, second)]
-    less = (pair[1] - pair[0]).dropna().reset_index()
+    less = (pair[0] - pair[1]).dropna().reset_index()
 
     parts = {stratum: less[less["stratum"] == stratum] for stratum in STRATA}
     whole = parts["all"]
@@ -594,12 +570,10 @@ def print_differences(found: pd.DataFrame, first: str, second: str) -> None:
             some = every[every["set"] == name]
             if some.empty:
                 continue
-            numbers = {measure: some[measure].to_numpy() for measure in names}
-            ends = bootstrap(numbers, grounds_of(some["world"]), np.mean)
-            cells = [
-                interval(pd.Series({k: ends[m, k] for k in ("value", "low", "high")}), 3)
-                for m in names
-            ]
+            cells = []
+            for measure in names:
+                *ends, _ = over_worlds(some[measure].to_numpy(), some["world"])
+                cells.append(interval(*ends))
             table.row(name, part, len(some), *cells)
 
 

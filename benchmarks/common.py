@@ -49,13 +49,16 @@ def arguments(
                             help="folder of the real terrains")  # fmt: skip
     if quick:
         parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument("--store", type=Path, metavar="DIR",
+                        help="folder for the tables of the evidence, as CSV")  # fmt: skip
     return parser
 
 
 def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
     """Parse the arguments of this process; check the selected names, and make --data a path.
 
-    From now on, the script ends without a traceback if nothing reads its output any more.
+    With --store, tables that have a name are written to this folder. From now on, the script ends
+    without a traceback if nothing reads its output any more.
     """
     given = parser.parse_args()
     _end_quietly_without_reader()
@@ -67,6 +70,7 @@ def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
         given.names = given.names or choices
     if getattr(given, "data", None) is not None:
         given.data = Path(given.data)
+    Table.folder = given.store
     return given
 
 
@@ -97,20 +101,18 @@ def timed(work: Callable[[], Any]) -> tuple[float, Any]:
     return time.perf_counter() - started, result
 
 
-def verdict(met: bool) -> str:
-    """Return the table entry for a target that is met or missed."""
-    return "yes" if met else "NO"
-
-
 # --- tables ---
 
 
 class Table:
-    """Markdown table that is printed row by row, and can be written as CSV."""
+    """Markdown table that is printed row by row, and is stored as CSV if it has a name."""
 
-    def __init__(self, *columns: str, first: int = 0, others: int = 0) -> None:
+    folder: Path | None = None
+    """Folder of stored tables; None to store none."""
+
+    def __init__(self, *columns: str, name: str = "", first: int = 0, others: int = 0) -> None:
         """Print the header; `first` and `others` are the minimum widths of the columns."""
-        self.columns, self.rows = columns, []
+        self.name, self.columns, self.rows = name, columns, []
         self._widths = [first, *(others for _ in columns[1:])]
         self._print(columns)
         self._print(("---", *("---:" for _ in columns[1:])))
@@ -119,12 +121,10 @@ class Table:
         """Print a row."""
         self.rows.append(cells)
         self._print(cells)
-
-    def write(self, file: Path) -> None:
-        """Write the table as CSV."""
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with file.open("w", newline="") as stream:
-            csv.writer(stream).writerows([self.columns, *self.rows])
+        if self.name and self.folder is not None:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with (self.folder / f"{self.name}.csv").open("w", newline="") as stream:
+                csv.writer(stream, lineterminator="\n").writerows([self.columns, *self.rows])
 
     def _print(self, cells: Iterable[object]) -> None:
         texts = [

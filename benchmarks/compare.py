@@ -1,18 +1,17 @@
 """Compare LOO of one model that is fitted as a class, as a function and by NumPyro's own MCMC.
 
-    python benchmarks/compare.py ["fit, NUTS"] [own] ... [-n 6 20] [--seeds 1]
+    python benchmarks/compare.py ["fit, NUTS"] [own] ... [-n 6 20] [--seeds 5]
 
 The missions are driven by the kinematic simulator on the example hillside, and all their rates have
 `n_ticks`. The model is `PooledTrust` with equal noise in all bounds. For the function and for
 NumPyro's MCMC, the same model is written as a NumPyro function. The true difference is 0 nats,
-except for the noise of half a tick that `fit` adds to `delta_v`; the target is a difference of less
-than 3 nats. Each row shows the `elpd` of a posterior and its difference from the `elpd` of `tb.fit`
-with importance sampling. It also shows the standard error of the difference over missions, its
-standard deviation over seeds, the largest k-hat, and the number of missions that were left out by
-refits.
+except for the noise of half a tick that `fit` adds to `delta_v`. Each row shows the `elpd` of a
+posterior and its difference from the `elpd` of `tb.fit` with importance sampling. It also shows the
+standard error of the difference over missions, its standard deviation over seeds, the largest
+k-hat, and the number of missions that were left out by refits.
 
 `own, az.compare` passes NumPyro's own MCMC to `arviz.compare`, which does not refit.
-`own, densities` does the same without `n_ticks`, as version 0.4 did; `tb.compare` refuses this
+`own, densities` does the same without `n_ticks`; `tb.compare` refuses this
 comparison.
 """
 
@@ -25,15 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-from common import Table, arguments, parsed, timed, verdict
+from common import Table, arguments, parsed, timed
 from numpyro.infer import MCMC, NUTS
 
 import trustbo as tb
 from trustbo.errors import TrustboError
 from trustbo.inference import loo
 
-TARGET = 3.0
-"""Largest difference in nats."""
 SHAPE = 10, 10
 ENDS = (9, 0), (0, 9)
 OF = "log_likelihood_of"
@@ -51,7 +48,7 @@ WAYS = (
 
 def main():
     """Print a table for each number of missions."""
-    parser = arguments(__doc__, names=WAYS, seeds=1)
+    parser = arguments(__doc__, names=WAYS, seeds=5)
     parser.add_argument("-n", type=int, nargs="+", default=[6, 20], help="numbers of missions")
     given = parsed(parser)
     warnings.filterwarnings("ignore", category=UserWarning)  # k-hat is shown in the table
@@ -94,7 +91,7 @@ def one_table(data, n_seeds, names):
 
     table = Table(
         "posterior", "elpd", "difference", "standard error", "sd over seeds", "p", "largest k-hat",
-        "refits", "s of the fit", f"< {TARGET:.0f} nats", first=16,
+        "refits", "CPU s of the fit", first=16, name="compare",
     )  # fmt: skip
     reference = [loo(ways[REFERENCE](seed), progress=False) for seed in range(n_seeds)]
     for name in names:
@@ -114,7 +111,7 @@ def one_row(table, name, fit, reference):
                 found.append(loo(posterior, progress=False))
         except TrustboError as refusal:
             reason, *_ = str(refusal).split(",")
-            table.row(name, f"refused: {reason}", *[""] * 6, f"{second:.1f}", "")
+            table.row(name, f"refused: {reason}", *[""] * 6, f"{second:.1f}")
             return
 
     each = np.array([
@@ -129,7 +126,7 @@ def one_row(table, name, fit, reference):
         name, f"{np.mean([one.elpd for one in found]):.1f}", f"{sums.mean():.2f}", f"{error:.2f}",
         f"{sums.std():.2f}", f"{np.mean([one.p for one in found]):.1f}",
         f"{max(float(one.pareto_k.max()) for one in found):.2f}", max(refits),
-        f"{np.mean(seconds):.1f}", verdict(bool((np.abs(sums) < TARGET).all())),
+        f"{np.mean(seconds):.1f}",
     )  # fmt: skip
 
 

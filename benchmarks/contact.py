@@ -28,7 +28,6 @@ import pandas as pd
 from baselines import line_of_sight, residual_process, running_mean
 from baselines.paths import PathPolicy
 from common import arguments, parsed
-from lost import lost_in
 from threadpoolctl import threadpool_limits
 from world_set import World, worlds
 from world_set.world import drawn
@@ -38,6 +37,7 @@ import trustbo as tb
 from trustbo.data import POST_SETS, Cell
 from trustbo.errors import TrustboError
 from trustbo.files import write_text
+from trustbo.study import lost_in
 
 MISSIONS = 15
 APART = 6

@@ -1,28 +1,32 @@
-"""Benchmark of campaigns that learn from earlier campaigns; prints the table of docs/worlds.md.
+"""Contact lost by campaigns that learn from earlier campaigns.
 
-    python benchmarks/earlier.py --data DIR --out out/earlier
+    python benchmarks/earlier.py --data DIR [--quick] [--csv FILE]
 
 In each world, an earlier campaign runs 6 missions from south-west to north-east. A new campaign
 runs 5 missions from north-west to south-east, under three conditions: without earlier missions,
 after the earlier campaign on the same terrain, and after an earlier campaign on another terrain
-whose deviation from the assumed world is of the same kind. The script compares the contact lost in
-the new campaigns in pairs.
+whose deviation from the assumed world is of the same kind. All have the defaults of campaigns, and
+missions have the same seeds under all conditions. The contact lost in the five missions is in
+bounds per mission. Intervals are those of a t test clustered by terrain.
 
-Results in --out are reused. `--variant` adds variants of the conditions.
+Results in --out are reused.
 """
 
-import json
 from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
+from groups import interval, over_worlds
 from world_set import World, worlds
 
 import trustbo as tb
+from trustbo.data import POST_SETS
+from trustbo.files import write_text
+from trustbo.study import lost_in
 
 PAIRS = {
     "synthetic-0": "synthetic-1",
@@ -51,94 +55,47 @@ FIRST, SECOND = "sw-ne", "nw-se"
 """Courses of the earlier and of the new campaign."""
 N_EARLIER = 6
 N_NEW = 5
-N_RESAMPLES = 10_000
-"""Bootstrap resamples of the worlds."""
-TARGETS = {"same terrain": 0.85, "other terrain": 0.95}
-"""Largest ratio of contact lost with and without earlier missions."""
-HURT = 0.05
-"""Additional loss per mission, in bounds, that no kind of worlds may have."""
+CONDITIONS = ("cold", "same terrain", "other terrain")
+"""Conditions of the new campaign; `cold` is without earlier missions."""
 
 
-class Restless:
-    """Policy that is greedy, but plans with `ucb` if the plan equals the last two."""
-
-    def __init__(self) -> None:
-        self.paths: list[Any] = []
-
-    def __call__(self, rng: np.random.Generator, draws: Any, planner: Any) -> Any:
-        """Plan a path."""
-        policies = tb.planning.policies.POLICIES
-        plan = policies["greedy"](rng, draws, planner)
-        if len(self.paths) >= 2 and self.paths[-2:] == [plan.path] * 2:
-            plan = policies["ucb"](rng, draws, planner)
-        self.paths.append(plan.path)
-        return plan
-
-
-def without_places(result: Any) -> Any:
-    """Return a result as if its missions were on another map."""
-    entries = tuple(
-        replace(entry, mission=replace(entry.mission, map="elsewhere"))
-        for entry in result.state.entries
-    )
-    state = replace(result.state, entries=entries)
-    return tb.campaign.Result(result.workspace, state, result.learner)
-
-
-Options = Callable[[Any, Any], dict[str, Any]]
-CONDITIONS: dict[str, Options] = {
-    "cold": lambda here, there: {},
-    "same terrain": lambda here, there: {"earlier": here()},
-    "other terrain": lambda here, there: {"earlier": there()},
-}
-"""Options of the new campaign, given functions that return the earlier results."""
-VARIANTS: dict[str, Options] = {
-    "same terrain, no places": lambda here, there: {"earlier": without_places(here())},
-    "same terrain, ucb": lambda here, there: {"earlier": here(), "policy": "ucb"},
-    "cold, restless": lambda here, there: {"policy": Restless()},
-    "same terrain, restless": lambda here, there: {"earlier": here(), "policy": Restless()},
-    "other terrain, restless": lambda here, there: {"earlier": there(), "policy": Restless()},
-    "both": lambda here, there: {"earlier": [there(), here()]},
-}
-
-
-def main():
-    parser = arguments(__doc__, data=True, out="out/earlier", quick="two worlds")
-    parser.add_argument("--variant", action="append", choices=VARIANTS, default=[])
-    parser.add_argument("--world", action="append", choices=PAIRS, help="default all")
+def main() -> None:
+    parser = arguments(__doc__ or "", data=True, out="out/earlier", quick="two worlds")
+    parser.add_argument("--csv", type=Path, help="CSV file for the rows")
     given = parsed(parser)
-    known = {
-        name: world
-        for name, world in worlds(given.data).items()
-        if given.data is not None or world.is_packaged
-    }
-    chosen = [n for n in given.world or PAIRS if n in known and PAIRS[n] in known]
-    if given.quick:
-        chosen = chosen[:2]
 
-    conditions = CONDITIONS | {name: VARIANTS[name] for name in given.variant}
+    every = worlds(given.data)
+    known = {n: world for n, world in every.items() if given.data or world.is_packaged}
+    chosen = [name for name in PAIRS if name in known and PAIRS[name] in known]
     rows = []
-    for name in chosen:
+    for name in chosen[:2] if given.quick else chosen:
         here, there = known[name], known[PAIRS[name]]
-        for condition, options in conditions.items():
-            lost = losses(here, there, condition, options, given.out)
-            rows.append({"world": name, "kind": here.kind, "condition": condition, "lost": lost})
-            print(name, condition, np.round(lost, 2).tolist(), f"{sum(lost):.2f}", flush=True)
-    report(pd.DataFrame(rows))
+        sources: dict[str, Callable[[], Any]] = {
+            "cold": tuple,
+            "same terrain": partial(earlier, here, given.out),
+            "other terrain": partial(earlier, there, given.out),
+        }
+        for condition in CONDITIONS:
+            lost = losses(here, condition, sources[condition], given.out)
+            label = {"world": name, "kind": here.kind, "condition": condition}
+            rows.append({**label, **{f"lost_{k}": x for k, x in enumerate(lost, start=1)}})
+            print(name, condition, f"{np.mean(lost):.2f}", flush=True)
+
+    table = pd.DataFrame(rows)
+    if given.csv is not None:
+        write_text(given.csv, table.round(4).to_csv(index=False))
+    report(table)
 
 
-def losses(here: World, there: World, condition: str, options: Options, out: Path) -> list[float]:
+def losses(here: World, condition: str, source: Callable[[], Any], out: Path) -> list[float]:
     """Return the contact lost in each mission of a new campaign, in bounds; read if known."""
-    file = out / "losses" / f"{here.name}, {condition}.json"
-    if file.exists():
-        return json.loads(file.read_text())
-
-    given = options(lambda: earlier(here, out), lambda: earlier(there, out))
-    campaign = run(here, SECOND, N_NEW, **given)
-    lost = campaign.table()["contact_lost"].tolist()
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(lost))
-    return lost
+    file = out / "losses" / f"{here.name}, {condition}.csv"
+    if not file.exists():
+        campaign = run(here, SECOND, N_NEW, earlier=source())
+        lost = pd.Series([lost_in(mission) for mission in campaign.missions], name="lost")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_text(file, lost.to_csv(index=False))
+    return pd.read_csv(file)["lost"].tolist()
 
 
 def earlier(world: World, out: Path) -> Any:
@@ -151,57 +108,31 @@ def earlier(world: World, out: Path) -> Any:
 
 def run(world: World, course: str, n: int, **options: Any) -> Any:
     """Run a campaign in a world."""
-    workspace = world.workspace()
+    workspace = world.workspace(n_posts=len(POST_SETS))
     return tb.iterate(
         workspace,
         *world.ends(course),
         simulator=world.simulator(workspace),
         n_iterations=n,
-        planner={"max_bounds": "shortest+4"},
         progress=False,
         **options,
     )
 
 
-def report(rows: pd.DataFrame):
-    """Print the contact lost by kind, and ratios to a campaign without earlier missions."""
-    lost = rows.assign(lost=rows["lost"].map(np.sum)).pivot(
-        index=["kind", "world"], columns="condition", values="lost"
-    )
-    lost = lost[list(dict.fromkeys(rows["condition"]))]
-
-    print("\nContact lost in the first five missions of the new campaign, in bounds\n")
-    table = Table("kind (worlds)", *lost.columns)
-    for kind, some in lost.groupby("kind", sort=False):
-        table.row(f"{kind} ({len(some)})", *(f"{value:.2f}" for value in some.mean()))
-    table.row(f"all ({len(lost)})", *(f"{value:.2f}" for value in lost.mean()))
-
-    print("\nCompared with the campaign without earlier missions\n")
-    table = Table("condition", "ratio", "target", "better", "worse", "worst kind, per mission")
-    for name in lost.columns:
-        base = "cold, restless" if name.endswith("restless") else "cold"
-        if name.startswith("cold") or base not in lost:
-            continue
-        change = lost[name] - lost[base]
-        low, high = interval(lost[name].to_numpy(), lost[base].to_numpy())
-        ratio = lost[name].sum() / lost[base].sum()
-        hurt = change.groupby("kind").mean() / N_NEW
-        table.row(
-            name,
-            f"{ratio:.2f} [{low:.2f}, {high:.2f}]",
-            TARGETS.get(name, ""),
-            int((change < -HURT * N_NEW).sum()),
-            int((change > HURT * N_NEW).sum()),
-            f"{hurt.max():+.3f} ({hurt.idxmax()})",
-        )
-
-
-def interval(new: np.ndarray, base: np.ndarray) -> tuple[float, float]:
-    """Return the 95 % bootstrap interval over worlds of the ratio of sums."""
-    rng = np.random.default_rng(0)
-    index = rng.integers(len(new), size=(N_RESAMPLES, len(new)))
-    low, high = np.quantile(new[index].sum(1) / base[index].sum(1), [0.025, 0.975])
-    return float(low), float(high)
+def report(rows: pd.DataFrame) -> None:
+    """Print the contact lost by kind, and the differences from new campaigns without others."""
+    lost = rows.assign(lost=rows[[f"lost_{k + 1}" for k in range(N_NEW)]].mean(axis=1))
+    wide = lost.pivot_table("lost", ["world", "kind"], "condition", sort=False).reset_index()
+    differences = [f"{name} minus cold" for name in CONDITIONS[1:]]
+    table = Table("kind (worlds)", *CONDITIONS, *differences)
+    kinds = {kind: wide[wide["kind"] == kind] for kind in dict.fromkeys(wide["kind"])}
+    for name, some in (kinds | {"all": wide}).items():
+        texts = []
+        for condition in CONDITIONS[1:]:
+            *ends, _ = over_worlds((some[condition] - some["cold"]).to_numpy(), some["world"])
+            texts.append(interval(*ends))
+        means = [f"{some[condition].mean():.3f}" for condition in CONDITIONS]
+        table.row(f"{name} ({len(some)})", *means, *texts)
 
 
 if __name__ == "__main__":

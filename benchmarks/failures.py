@@ -1,58 +1,22 @@
-"""Signs of failures, and the failure probability of plans; parts of docs/failures.md, in Markdown.
+"""Which measure of tilt separates the bounds that fail?
 
-    python benchmarks/failures.py [part ...] --data DIR
+    python benchmarks/failures.py --data DIR
 
-The part `separation` simulates all bounds with all next moves in the worlds whose slope limit is 2
-degrees too high, and prints how well several measures of tilt separate the bounds that fail from
-the others.
-
-The part `price` prints the failure probability of plans on wellington, computed from the product of
-means, from components, and from all draws.
+In the worlds whose slope limit is 2 degrees too high, all bounds with all next moves are simulated.
+The table shows the area under the ROC curve of several measures of tilt: 1 if a threshold separates
+the bounds that fail from the others, and 0.5 if the tilt contains no information.
 """
 
 import dataclasses
 import warnings
-from itertools import product
 
 import numpy as np
 from common import Table, arguments, parsed
 from world_set import worlds
 
-import trustbo as tb
-from trustbo.hazard import Hazard
-from trustbo.hazard.given import GivenRisk
 from trustbo.simulation.replicates import replicated
 from trustbo.workspace.difficulty import MEASURES
-from trustbo.workspace.moves import END, MOVES, pairs_along
-
-PRIORS = {
-    "N(1, 4²)": Hazard(margin=(1.0, 4.0), limit="measured"),
-    "default": Hazard(),
-}
-"""Priors of the margin: the prior of version 0.3, and the default."""
-
-
-def print_price():
-    """Print the failure probability of plans before any mission and after one failure."""
-    table = Table("prior of the margin", "course", "plan", "product", "five components", "draws")
-    workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10), tb.Team())
-    courses = {"sw-ne": ((9, 0), (0, 9)), "nw-se": ((0, 0), (9, 9))}
-    for (prior, hazard), (course, ends) in product(PRIORS.items(), courses.items()):
-        campaign = tb.Campaign(workspace, *ends, hazard=hazard)
-        path = campaign.ask().path
-        table.row(prior, course, "first", *chances(campaign.risk, path))
-        campaign.fail("stuck", where=path[len(path) // 2])
-        path = campaign.ask().path
-        table.row(prior, course, "after one failure", *chances(campaign.risk, path))
-
-
-def chances(risk, path):
-    """Compute the failure probability of a path from means, components, and 20 000 draws."""
-    risks = GivenRisk(risk.mean), GivenRisk(risk.mean, components=risk.components())
-    joint = [one.failure(path) for one in risks]
-    drawn = risk.draw(20_000, seed=1)[:, *pairs_along(path, 1).T]
-    return [f"{p:.3f}" for p in (*joint, 1.0 - np.prod(1.0 - drawn, axis=1).mean())]
-
+from trustbo.workspace.moves import END, MOVES
 
 LOOKAHEADS = (0.5, 3.0)
 """True look-aheads, m, of robots for which 1.5 m is assumed."""
@@ -61,7 +25,7 @@ LOOKAHEADS = (0.5, 3.0)
 def print_separation(given):
     """Print the area under the ROC curve of the predicted tilt as a sign of failure, by world.
 
-    The tilt is that of the route, as in version 0.4, or that of the driven curve, and that of the
+    The tilt is that of the route, or that of the driven curve, and that of the
     true next move, or that of the next move in the same direction. An area of .5 means that it says
     nothing about failures.
     """
@@ -69,7 +33,7 @@ def print_separation(given):
     chosen = [world for world in chosen if given.data or world.is_packaged]
     columns = ["route, straight on", "route", "curve, straight on", "curve"]
     others = [f"curve, {ahead:g} m" for ahead in LOOKAHEADS]
-    table = Table("world", "passed", *columns, *others)
+    table = Table("world", "passed", *columns, *others, name="tilt")
     areas = []
     for world in chosen[: 1 if given.quick else None]:
         simulator = world.simulator(world.workspace())
@@ -104,7 +68,7 @@ def straight_on(tilt):
 
 
 def route_tilts(workspace, exists):
-    """Compute the largest tilt on the robots' routes, averaged over 1 m, as in version 0.4."""
+    """Compute the largest tilt on the robots' routes, averaged over 1 m."""
     posts = workspace.posts
     tilts, known = np.full(exists.shape, np.nan), {}
     for m, row, col, after in np.argwhere(exists).tolist():
@@ -147,14 +111,11 @@ def area_under(tilt, passed):
 
 def main():
     parser = arguments(
-        __doc__, names=["separation", "price"], data=True, quick="one world"
+        __doc__, data=True, quick="one world"
     )  # fmt: skip
     given = parsed(parser)
     warnings.simplefilter("ignore")
-    if "price" in given.names:
-        print_price()
-    if "separation" in given.names:
-        print_separation(given)
+    print_separation(given)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,8 @@
 
 `learning`: contact lost by mission, for each group of worlds and setting. `worlds`: trustbo minus a
 baseline in each world, with the t interval of each group. `arrivals`: predicted probability that
-a plan fails, and the share of plans that failed.
+a plan fails, and the share of plans that failed. `intervals`: shares of true rates in 90 %
+intervals of trust, and their width. `paths`: the paper's method minus random paths.
 """
 
 from collections.abc import Callable
@@ -13,12 +14,14 @@ from pathlib import Path
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
+from calibration import LEAST, STRATA, by_world, rows_in
 from common import arguments, parsed
-from contact import MISSIONS, SETTINGS
-from groups import ALIKE
+from contact import MISSIONS
+from groups import ALIKE, over_worlds
 from matplotlib.figure import Figure
 from scipy import stats
-from tables import OURS, TITLES, difference, of_worlds, rows_of
+from tables import OURS, STORED, TITLES, difference, of_worlds, rows_of, settings
 
 from trustbo.plots.style import GREY, PAGE, RC, ROBOTS
 
@@ -33,6 +36,12 @@ DARK = {
     "ytick.color": "0.85", "axes.edgecolor": "0.6", "legend.labelcolor": "0.85",
 }  # fmt: skip
 """Colours for dark pages, on the background of the site."""
+OF_PAPER = {
+    "lost per mission": "contact lost, bounds",
+    "regret after": "regret after 8 missions, %",
+    "sd of weights": "sd of weights",
+}
+"""Columns of the rows of `paper.py` that are drawn, and their titles."""
 _FARTHEST = 1.0
 """Largest difference that is drawn; dots beyond it are named at the edge."""
 _BINS = (0.01, 0.03, 0.1, 0.3)
@@ -44,11 +53,11 @@ _RANGE = (1e-3, 1.0)
 def learning() -> Figure:
     """Draw the mean contact lost by mission, a column for each group and a row for each setting."""
     figure, axes = plt.subplots(
-        len(SETTINGS), len(ALIKE), figsize=(PAGE, 3.6), sharex=True, sharey="col",
-        layout="constrained",
+        len(settings()), len(ALIKE), figsize=(PAGE, 0.8 + 1.4 * len(settings())), sharex=True,
+        sharey="col", squeeze=False, layout="constrained",
     )  # fmt: skip
     missions = np.arange(1, MISSIONS + 1)
-    for row, setting in zip(axes, SETTINGS, strict=True):
+    for row, setting in zip(axes, settings(), strict=True):
         rows = rows_of(setting)
         for panel, (group, kinds) in zip(row, ALIKE.items(), strict=True):
             some = rows[rows["kind"].isin(kinds)]
@@ -56,7 +65,7 @@ def learning() -> Figure:
                 of_method = some[some["method"] == method]
                 lost = of_method[[f"lost_{k}" for k in missions]].mean()
                 panel.plot(missions, lost, color=colour, label=method, linewidth=1.3)
-            if setting == next(iter(SETTINGS)):
+            if setting == settings()[0]:
                 panel.set_title(group.replace(", ", ",\n", 1), fontsize=8.0)
             panel.set_ylim(bottom=0.0)
             panel.set_xticks([1, 5, 10, 15])
@@ -70,10 +79,10 @@ def learning() -> Figure:
 def worlds() -> Figure:
     """Draw a dot for each world, and a bar for the t interval of each group."""
     figure, axes = plt.subplots(
-        1, len(SETTINGS), figsize=(PAGE, 2.6), sharey=True, layout="constrained"
+        1, len(settings()), figsize=(PAGE, 2.6), sharey=True, squeeze=False, layout="constrained"
     )
     rng = np.random.default_rng(0)
-    for panel, setting in zip(axes, SETTINGS, strict=True):
+    for panel, setting in zip(axes[0], settings(), strict=True):
         lost = of_worlds(rows_of(setting), "lost")
         for k, (_, kinds) in enumerate(ALIKE.items()):
             some = lost[lost["kind"].isin(kinds)]
@@ -95,9 +104,9 @@ def worlds() -> Figure:
 def arrivals() -> Figure:
     """Draw the share of plans that failed, by predicted probability, and how many there were."""
     figure, axes = plt.subplots(
-        1, len(SETTINGS), figsize=(PAGE, 2.8), sharey=True, layout="constrained"
+        1, len(settings()), figsize=(PAGE, 2.8), sharey=True, squeeze=False, layout="constrained"
     )
-    for panel, setting in zip(axes, SETTINGS, strict=True):
+    for panel, setting in zip(axes[0], settings(), strict=True):
         rows = rows_of(setting)
         rows = rows[rows["method"] == OURS]
         predicted = 1.0 - rows[[f"p_{k + 1}" for k in range(MISSIONS)]].to_numpy().ravel()
@@ -118,12 +127,68 @@ def arrivals() -> Figure:
         panel.set(xscale="log", yscale="log", xlim=_RANGE, ylim=_RANGE)
         panel.set_title(TITLES[setting], fontsize=8.0)
         panel.set_xlabel("predicted probability of failure")
-    axes[0].set_ylabel("share that failed")
+    axes[0, 0].set_ylabel("share that failed")
+    return figure
+
+
+def intervals() -> Figure:
+    """Draw the coverage and width of 90 % intervals of trust, by true rate and by model."""
+    found = by_world(rows_in(STORED / "calibration.csv"))
+    found = found[(found["stratum"] == "all") | (found["n"] >= LEAST)]
+    figure, axes = plt.subplots(
+        2, 2, figsize=(PAGE, 3.6), sharex=True, sharey="row", layout="constrained"
+    )
+    colours = dict(zip(dict.fromkeys(found["model"]), (ROBOTS[0], ROBOTS[1]), strict=True))
+    for column, of_set in zip(axes.T, ("driven", "undriven"), strict=True):
+        for panel, measure in zip(column, ("trust90", "width"), strict=True):
+            for k, (model, colour) in enumerate(colours.items()):
+                some = found[(found["set"] == of_set) & (found["model"] == model)]
+                for x, stratum in enumerate(STRATA):
+                    here = some[some["stratum"] == stratum]
+                    mean, low, high, _ = over_worlds(here[measure].to_numpy(), here["world"])
+                    at = x + 0.15 * (2 * k - 1)
+                    panel.plot([at, at], [low, high], color=colour, linewidth=1.5)
+                    label = model if x == 0 else None
+                    panel.plot(at, mean, "o", color=colour, markersize=4.0, label=label)
+        column[0].axhline(0.9, color=GREY, linewidth=0.8)
+        column[0].set_title(f"{of_set} bounds", fontsize=8.0)
+        column[1].set_ylim(bottom=0.0)
+        column[1].set_xticks(range(len(STRATA)), ["all", "exactly 1", ".97 to 1", "below .97"])
+        column[1].set_xlabel("true rate")
+    axes[0, 0].set_ylabel("share in the interval")
+    axes[1, 0].set_ylabel("width")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+def paths() -> Figure:
+    """Draw the paper's method minus random paths, for both objectives, with t intervals."""
+    numbers = pd.read_csv(STORED / "paper.csv")
+    figure, axes = plt.subplots(
+        1, len(OF_PAPER), figsize=(PAGE, 1.5), sharey=True, layout="constrained"
+    )
+    objectives = {"(6)": "cost (6)", "mean": "mean trust"}
+    for panel, (column, title) in zip(axes, OF_PAPER.items(), strict=True):
+        for k, objective in enumerate(objectives):
+            greedy, random = (
+                numbers[numbers["method"] == f"{policy}, {objective}"].set_index("world")[column]
+                for policy in ("greedy", "random")
+            )
+            apart = (greedy - random).dropna()
+            mean, low, high, _ = over_worlds(apart.to_numpy(), apart.index)
+            panel.plot([low, high], [k, k], color=SHOWN[OURS], linewidth=2.0)
+            panel.plot(mean, k, "o", color=SHOWN[OURS], markersize=5.0)
+        panel.axvline(0.0, color=GREY, linewidth=0.8)
+        panel.set_xlabel(title)
+        panel.set_yticks(range(len(objectives)), list(objectives.values()))
+        panel.set_ylim(len(objectives) - 0.5, -0.5)
     return figure
 
 
 DRAWN: dict[str, Callable[[], Figure]] = {
-    "learning": learning, "worlds": worlds, "arrivals": arrivals,
+    "learning": learning, "worlds": worlds, "arrivals": arrivals, "intervals": intervals,
+    "paths": paths,
 }  # fmt: skip
 
 

@@ -14,9 +14,9 @@
 - program: compare `PooledTrust().program`, passed as a function, with `sampler="nuts"` of the
   class.
 - samplers: fit functions of own_functions.py to ten missions in the terrain example by importance
-  sampling, with three seeds, and once each by trustbo's NUTS, by NumPyro's own MCMC (NUTS, 4
-  vectorised chains of 1000 + 1000 draws, otherwise with default settings) and by nutpie (4 chains
-  of 1000 + 1000 draws). Print the CPU time without compilation. Then compare the means and standard
+  sampling, by trustbo's NUTS, by NumPyro's own MCMC (NUTS, 4 vectorised chains of 1000 + 1000
+  draws, otherwise with default settings) and by nutpie (4 chains of 1000 + 1000 draws), with five
+  seeds each. Print the CPU time without compilation. Then compare the means and standard
   deviations of importance sampling with those of a long run of NUTS. If R-hat of the long run is
   large, it is no reference. `--slow` adds two functions that take minutes.
 - sbc: check the fits of four functions by simulation-based calibration.
@@ -25,16 +25,15 @@
 import sys
 import time
 import warnings
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
-import summary
+import pandas as pd
 from common import Table, arguments, parsed
-from groups import holm
+from groups import holm, interval, over_worlds
 from jax.flatten_util import ravel_pytree
 from numpyro.infer import MCMC, NUTS, Predictive
 from numpyro.infer.util import initialize_model
@@ -44,6 +43,7 @@ from scipy import stats
 from world_set import worlds
 
 import trustbo as tb
+from trustbo.data import POST_SETS
 from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.functions.data import arrays_of, data_of
 from trustbo.inference.functions.draws import draws_of_drift, function_drift
@@ -53,7 +53,7 @@ from trustbo.inference.functions.missions import FunctionData
 from trustbo.inference.functions.source import OfFunction
 from trustbo.models import ContactRate, PooledTrust, TrustParams
 from trustbo.models.observations import Observations
-from trustbo.study import run_grid
+from trustbo.study import lost_in
 
 FEATURES = ("traversability", "line_of_sight")
 START, GOAL = (7, 0), (0, 7)
@@ -74,7 +74,7 @@ WORLDS = (
     "synthetic-1-dense", "synthetic-1-one-poor", "synthetic-0-rain", "synthetic-2-jammer",
     "synthetic-1-radio",
 )  # fmt: skip
-SEEDS = 1, 2, 3  # of importance sampling; seed 0 compiles
+SEEDS = 1, 2, 3, 4, 5  # seed 0 compiles
 LONG = {"draws": 5000, "warmup": 1000}  # per chain of the reference
 
 
@@ -176,7 +176,8 @@ def n_compiled(model):
 
 def own_campaign(names):
     workspace = tb.Workspace.from_terrain(tb.terrain.example(), (10, 10))
-    table = Table("function", "CPU s", "learned", "samplers", "warnings")
+    table = Table("function", "CPU s", "learned", "samplers", "warnings",
+                  name="functions_campaign")  # fmt: skip
     for name in names:
         started = time.process_time()
         with warnings.catch_warnings(record=True) as caught:
@@ -191,19 +192,28 @@ def own_campaign(names):
             print(f"  {message}", flush=True)
 
 
-def as_default(out):
-    chosen = [world for world in worlds().values() if world.name in WORLDS]
-    scenes = {
-        world.name: partial(world.scene, "sw-ne", out / "truths", "shortest+4") for world in chosen
-    }
-    cases = {"as a function": {"model": default_as_function}, "default": {}}
-    started = time.process_time()
-    runs = run_grid(cases, scenes, out, n_missions=10, n_jobs=1)
-    print(f"{time.process_time() - started:.0f} CPU s", flush=True)
-    table = summary.numbers_of(runs)
-    print(table.pivot(index="scene", columns="case", values="lost while learning").round(4))
-    pairs = summary.differences(table, "as a function")
-    print(pairs[["lost while learning", "seconds"]].round(4).T.to_string(), flush=True)
+def as_default():
+    """Compare campaigns with the default model, as a class and as a function, in ten worlds."""
+    table = Table("world", "bounds lost, default", "as a function", "CPU s, default",
+                  "as a function", name="functions_as_default")  # fmt: skip
+    rows = []
+    for name in WORLDS:
+        world = worlds()[name]
+        workspace = world.workspace(n_posts=len(POST_SETS))
+        row = {"world": name}
+        for label, model in {"default": None, "function": default_as_function}.items():
+            started = time.process_time()
+            campaign = tb.Campaign(workspace, *world.ends("sw-ne"), model=model, progress=False)
+            for _ in campaign.run(world.simulator(workspace), 10):
+                pass
+            row[f"{label} s"] = time.process_time() - started
+            row[label] = np.mean([lost_in(mission) for mission in campaign.missions])
+        rows.append(row)
+        table.row(name, f"{row['default']:.3f}", f"{row['function']:.3f}",
+                  f"{row['default s']:.0f}", f"{row['function s']:.0f}")  # fmt: skip
+    rows = pd.DataFrame(rows)
+    less = (rows["function"] - rows["default"]).to_numpy()
+    table.row("function minus default", "", interval(*over_worlds(less, rows["world"])[:3]), "", "")
 
 
 def in_terrain():
@@ -217,8 +227,9 @@ def in_terrain():
 
 def samplers(names):
     missions = in_terrain()
-    table = Table("function", "sampler", "seed", "CPU s", "effective draws",
-                  "ms per effective draw", "complaints")  # fmt: skip
+    table = Table("function", "sampler", "seeds", "refused or warned", "CPU s, median",
+                  "effective draws, median", "least", "ms per effective draw, median", "worst",
+                  name="functions_samplers")  # fmt: skip
     others = []
     for name in names:
         function = FUNCTIONS[name]
@@ -227,32 +238,45 @@ def samplers(names):
             return tb.fit(missions, function, sampler=sampler, seed=seed, latent=False,
                           progress=False, **options)  # fmt: skip
 
-        def row(sampler, seed, seconds, n, complaints, name=name):
-            table.row(name, sampler, seed, f"{seconds:.1f}", f"{n:.0f}",
-                      f"{1000.0 * seconds / n:.2f}", "; ".join(complaints) or "none")  # fmt: skip
-
         found = []
-        fitted("importance", 0, check=False)
-        for seed in SEEDS:
-            tree, seconds, complaints = timed_fit(fitted, "importance", seed)
-            row("importance", seed, seconds, effective(tree.attrs), complaints)
-            found.append(moments(tree))
 
-        long = fitted("nuts", 0, check=False, **LONG)  # it also compiles
-        tree, seconds, complaints = timed_fit(fitted, "nuts", 1)
-        row("nuts", 1, seconds, effective(tree.attrs), complaints)
+        def importance(seed, fitted=fitted, found=found):
+            tree, seconds, complaints = timed_fit(fitted, "importance", seed)
+            found.append(moments(tree))
+            return seconds, effective(tree.attrs), complaints
+
+        def nuts(seed, fitted=fitted):
+            tree, seconds, complaints = timed_fit(fitted, "nuts", seed)
+            return seconds, effective(tree.attrs), complaints
 
         data = unpadded(as_model(function), missions)
-        compilation, *_ = own_mcmc(function, data, 0, warmup=FEW, n=FEW)
-        seconds, diagnosed, complaints = own_mcmc(function, data, 1, warmup=1000)
-        row("NumPyro", 1, seconds - compilation, diagnosed["ess_bulk"], complaints)
-        seconds, diagnosed, complaints = by_nutpie(function, data, 1)
-        row("nutpie", 1, seconds, diagnosed["ess_bulk"], complaints)
+
+        def numpyro_nuts(seed, function=function, data=data):
+            compilation, *_ = own_mcmc(function, data, 0, warmup=FEW, n=FEW)
+            seconds, diagnosed, complaints = own_mcmc(function, data, seed, warmup=1000)
+            return seconds - compilation, diagnosed["ess_bulk"], complaints
+
+        def nutpie(seed, function=function, data=data):
+            seconds, diagnosed, complaints = by_nutpie(function, data, seed)
+            return seconds, diagnosed["ess_bulk"], complaints
+
+        fitted("importance", 0, check=False)  # compiles
+        long = fitted("nuts", 0, check=False, **LONG)  # so does this
+        ways = {"importance": importance, "NUTS": nuts, "NumPyro": numpyro_nuts, "nutpie": nutpie}
+        for sampler, sample in ways.items():
+            seconds, effective_draws, complaints = zip(*map(sample, SEEDS), strict=True)
+            seconds, effective_draws = np.array(seconds), np.array(effective_draws)
+            each = 1000.0 * seconds / effective_draws
+            table.row(name, sampler, len(SEEDS), sum(map(bool, complaints)),
+                      f"{np.median(seconds):.1f}", f"{np.median(effective_draws):.0f}",
+                      f"{effective_draws.min():.0f}", f"{np.median(each):.2f}",
+                      f"{each.max():.2f}")  # fmt: skip
         others.append((name, *differences(found, long)))
         print(f"  {name}: {others[-1][1:]}", file=sys.stderr, flush=True)
 
     table = Table("function", "largest difference of means, sd", "of", "ratios of sds",
-                  "R-hat of the long run", "its ESS", "its divergences")  # fmt: skip
+                  "R-hat of the long run", "its ESS", "its divergences",
+                  name="functions_agreement")  # fmt: skip
     for cells in others:
         table.row(*cells)
 
@@ -406,13 +430,20 @@ def with_rates(awareness, rates, features):
 
 
 def sbc(names, sets):
+    table = Table("function", "sets", "refused", "parameters", "least p", "of", "rejected",
+                  name="functions_sbc")  # fmt: skip
     for name in names:
-        print(f"sbc of {name}", flush=True)
-        sbc_of(FUNCTIONS[name], sets)
+        p, refused = sbc_of(FUNCTIONS[name], sets)
+        least = min(p, key=p.get)
+        rejected = int((np.array(holm(list(p.values()))) < LEVEL).sum())
+        table.row(name, sets, refused, len(p), f"{p[least]:.4f}", least, rejected)
 
 
 def sbc_of(function, sets):
-    """Rank true parameters among posterior draws (Talts et al. 2018)."""
+    """Rank true parameters among posterior draws (Talts et al. 2018).
+
+    Returns the p values of uniform ranks by parameter, and the number of refused fits.
+    """
     driven = in_terrain()[::3]
     data = unpadded(as_model(function), driven) | {"contact_rate": None, "n_ticks": None}
     ranks = {}
@@ -442,23 +473,20 @@ def sbc_of(function, sets):
 
         if (seed + 1) % PRINTED == 0:
             means = ", ".join(f"{name} {np.mean(r) / RANKED:.2f}" for name, r in ranks.items())
-            print(f"  {seed + 1} of {sets}: {refused} bad fits, mean ranks {means}", flush=True)
+            print(f"  {seed + 1} of {sets}: {refused} bad fits, mean ranks {means}",
+                  file=sys.stderr, flush=True)  # fmt: skip
 
-    table = Table("parameter", "p of uniform ranks", "mean rank (expected .5)")
     p = {}
     for name, found in ranks.items():
         counts = np.bincount(np.array(found) * 10 // (RANKED + 1), minlength=10)
         p[name] = stats.chisquare(counts).pvalue
-        table.row(name, f"{p[name]:.3f}", f"{np.mean(found) / RANKED:.3f}")
-    rejected = int((np.array(holm(list(p.values()))) < LEVEL).sum())
-    print(f"  {sets} sets, {rejected} of {len(p)} parameters rejected, {refused} fits with bad "
-          "diagnostics", flush=True)  # fmt: skip
+    return p, refused
 
 
 PARTS = "campaign", "own_campaign", "as_default", "program", "samplers", "sbc"
 
 if __name__ == "__main__":
-    parser = arguments(__doc__, names=PARTS, seeds=3, out="out/functions")
+    parser = arguments(__doc__, names=PARTS, seeds=3)
     parser.add_argument("--sets", type=int, default=200, help="data sets of sbc, default 200")
     parser.add_argument("--functions", nargs="+", choices=FUNCTIONS, metavar="NAME",
                         help="functions of own_campaign, samplers or sbc")  # fmt: skip
@@ -467,7 +495,7 @@ if __name__ == "__main__":
     calls = {
         "campaign": lambda: campaign(given.seeds),
         "own_campaign": lambda: own_campaign(given.functions or OF_CAMPAIGNS),
-        "as_default": lambda: as_default(given.out),
+        "as_default": lambda: as_default(),
         "program": lambda: program(given.seeds),
         "samplers": lambda: samplers(given.functions or SHORT + (SLOW if given.slow else ())),
         "sbc": lambda: sbc(given.functions or CALIBRATED, given.sets),

@@ -16,7 +16,7 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-from common import arguments, parsed
+from common import Table, arguments, parsed
 from peers import networkx_planner
 from peers.every_path import STEPS, TooManyError, World, best_walk, score_along, to_goal
 from scipy.special import logit
@@ -275,7 +275,8 @@ def main():
         outcome["with sets of posts"] += planner.workspace.n_posts > 1
         for what in wrong:
             print(f"WRONG {index}: {what}", flush=True)
-    print(", ".join(f"{count} {name}" for name, count in outcome.items() if isinstance(name, str)))
+    counts = {name: count for name, count in outcome.items() if isinstance(name, str)}
+    Table(*counts, name="plans_exact").row(*counts.values())
     return 1 if outcome["wrong"] else 0
 
 

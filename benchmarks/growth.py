@@ -107,7 +107,11 @@ def main() -> None:
 
     steps = STEPS if given.failures else STEPS[:-1]
     table = Table(
-        "cells", "pixels", *(f"{name}, s" for name in steps), *(f"{name}, MiB" for name in steps)
+        "cells",
+        "pixels",
+        *(f"{name}, s" for name in steps),
+        *(f"{name}, MiB" for name in steps),
+        name="growth",
     )
     for size in given.names or SIZES:
         n_pixels = int(size) * PIXELS.get(size, 50)

@@ -9,12 +9,12 @@ For each prior, it prints how many posterior means are off by more than .2 prior
 is accepted, and how many posteriors are rejected.
 """
 
-import argparse
 import itertools
 import time
 from collections import Counter
 
 import numpy as np
+from common import Table, arguments, parsed
 from scipy import special
 
 from trustbo.hazard import Hazard
@@ -99,11 +99,15 @@ def reference(prior, trials, n, seed):
 
 
 def main():
-    """Print one line for each prior of the margin."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    """Print one row for each prior of the margin."""
+    parser = arguments(__doc__ or "")
     parser.add_argument("--sets", type=int, default=100)
     parser.add_argument("--particles", type=int, default=4096)
-    given = parser.parse_args()
+    given = parsed(parser)
+    table = Table(
+        "prior of the margin", "sets", "rejected", "largest k-hat", "off by > .2 prior sds",
+        "largest", "median", "CPU s", name="hazard",
+    )  # fmt: skip
     for name, hazard in PRIORS.items():
         rows = []
         for seed in range(given.sets):
@@ -113,16 +117,14 @@ def main():
             points = sample(prior, trials, np.random.default_rng(seed))[0]
             seconds = time.process_time() - started
             expected = reference(prior, trials, given.particles, seed)
-            off = np.abs(points.weight @ points.z - expected).max()
+            off = np.abs(points.weight @ points.x - expected).max()
             rows.append((off, points.k_hat, seconds))
         off, k_hat, seconds = np.array(rows).T
         refused = k_hat > 0.7
-        print(
-            f"{name}: off by > .2 prior sds {((off > 0.2) & ~refused).sum()} of {given.sets}, "
-            f"largest {off[~refused].max():.2f}, median {np.median(off):.3f}; "
-            f"rejected {refused.sum()}, largest k-hat {k_hat.max():.2f}; "
-            f"{np.median(seconds):.2f} s"
-        )
+        table.row(
+            name, given.sets, refused.sum(), f"{k_hat.max():.2f}", ((off > 0.2) & ~refused).sum(),
+            f"{off[~refused].max():.2f}", f"{np.median(off):.3f}", f"{np.median(seconds):.2f}",
+        )  # fmt: skip
 
 
 if __name__ == "__main__":

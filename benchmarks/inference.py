@@ -123,7 +123,7 @@ def missions_with_memory(n, seed=1):
 def timed_fits(given):
     """Print the CPU time of fits without predictions, first and later in a campaign."""
     columns = "fit", "CPU s, median", "least", "most", "kish", "ms per effective point", "k-hat"
-    table = Table(*columns, first=40)
+    table = Table(*columns, first=40, name="fits")
     one_case(table, "default model, 3 missions", 1, label="first fit of the process")
     for name in given.only or FITS:
         one_case(table, name, given.seeds)
@@ -171,7 +171,7 @@ def accuracy(given):
     """Print errors of the means of parameters in fits of few missions with little noise."""
     table = Table(
         "missions of the demo", "rms error", "largest rms error", "of", "largest bias", "of",
-        "CPU s, median", "kish", "k-hat", "largest",
+        "CPU s, median", "kish", "k-hat", "largest", name="fits_accuracy",
     )  # fmt: skip
     data = hillside(15)
     for n in 3, 8, 15:
@@ -247,7 +247,7 @@ def compared(data, n_seeds):
         "sampler", "effective size", "worst", "CPU s", "worst", "effective draws per s", "worst",
         "divergences, worst", *(f"{what} of {n}" for n in NAMES for what in ("mean", "range")),
     )  # fmt: skip
-    table = Table(*columns, first=40)
+    table = Table(*columns, first=40, name="fits_peers")
     for name, found in runs.items():
         size, seconds, n_divergent, *means = np.array(found).T
         rate = size / seconds
@@ -309,7 +309,7 @@ def compiled_samplers(data):
 def memory(given):
     """Print the bytes of a posterior of 60 missions, whole and without what grows with missions."""
     fitted = tb.fit(missions(60), DEFAULT, check=False)
-    table = Table("posterior of 60 missions", "MB", first=40)
+    table = Table("posterior of 60 missions", "MB", first=40, name="fits_memory")
     for name, group in fitted.children.items():
         table.row(f"group {name}", f"{group.nbytes / 1e6:.2f}")
     table.row("all groups", f"{fitted.nbytes / 1e6:.2f}")

@@ -3,7 +3,6 @@
 python benchmarks/kills.py [--kills 20]
 """
 
-import argparse
 import signal
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from common import Table, arguments, parsed
 
 import trustbo as tb
 from trustbo.models import TrustParams
@@ -46,10 +46,10 @@ def numbers(folder):
 
 def main():
     """Kill processes at random moments, resume their campaigns, and compare."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = arguments(__doc__ or "")
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--folder", help="run one campaign here (used by the script itself)")
-    given = parser.parse_args()
+    given = parsed(parser)
     if given.folder:
         go_on(given.folder)
         return
@@ -72,7 +72,8 @@ def main():
             go_on(folder)
             n_campaigns += 1
             n_same += numbers(folder) == expected
-    print(f"{n_kills} kills; {n_same} of {n_campaigns} campaigns identical")
+    table = Table("kills", "campaigns", "identical", name="kills")
+    table.row(n_kills, n_campaigns, n_same)
 
 
 if __name__ == "__main__":

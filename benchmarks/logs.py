@@ -77,7 +77,7 @@ def simulated():
 
 def score(logs, window):
     """Print the log score of each model, one bound ahead, on the other half of the log."""
-    table = Table("window", "fitted to", "model", "log score", "n")
+    table = Table("window", "fitted to", "model", "log score", "n", name="logs")
     for learned, other in (("first", "second"), ("second", "first")):
         train, test = (tb.logs.read_tracks(*logs[name], window=window) for name in (learned, other))
         for name, model in MODELS.items():
@@ -89,7 +89,7 @@ def score(logs, window):
 
 def memory(logs, window):
     """Print the log Bayes factor for trust that depends on trust in the previous bound."""
-    table = Table("window", "half", "for beta0 > 0", "beta0")
+    table = Table("window", "half", "for beta0 > 0", "beta0", name="logs_memory")
     for name, tables in logs.items():
         missions, model = tb.logs.read_tracks(*tables, window=window), MODELS["counts"]
         model = model.for_features(missions[0].features)

@@ -39,7 +39,7 @@ def main():
     data = hillside(max(map(int, given.names)))
     table = Table(
         "missions", "refused", "R-hat", "ESS", "divergences", "steps per draw", "first, s",
-        "later, s", "ms per effective draw", "difference, standard errors",
+        "later, s", "ms per effective draw", "difference, standard errors", name="nuts",
     )  # fmt: skip
     for name in given.names:
         table.row(name, *measured(data[: int(name)], given.seeds))

@@ -9,7 +9,8 @@ world; all sets of a bound share the random numbers, and T2 closes up to the sam
 
 The table compares the contact lost in a bound, as a share of that of the standard set, if the set
 is chosen at random, by each of the two scores, or in hindsight, and Spearman's correlation of each
-score with contact over the sets of a bound. Intervals are 95 %, by a bootstrap over terrains.
+score with contact over the sets of a bound. Intervals are those of a t test clustered by
+terrain.
 """
 
 from collections.abc import Iterator
@@ -18,9 +19,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
-from groups import ALIKE, grounds_of, interval
+from groups import ALIKE, interval, over_worlds
 from scipy.stats import rankdata
-from summary import bootstrap
 from world_set import World, worlds
 
 from trustbo.data import POST_SETS, Cell
@@ -112,17 +112,14 @@ def report(rows: pd.DataFrame) -> None:
     """Print the table of all worlds and of groups of kinds."""
     of_worlds = rows.groupby(["world", "kind"]).apply(compared, include_groups=False).reset_index()
     names = [name for name in of_worlds if name not in ("world", "kind")]
-    table = Table("worlds", "n", *names, first=26)
+    table = Table("worlds", "n", *names, first=26, name="overwatch")
     groups = {"all": KINDS, **{name: kinds for name, kinds in ALIKE.items() if {*kinds} & {*KINDS}}}
     for name, kinds in groups.items():
         some = of_worlds[of_worlds["kind"].isin(kinds)]
-        found = bootstrap(
-            {name: some[name].to_numpy() for name in names}, grounds_of(some["world"]), np.mean
-        )
         texts = []
         for what in names:
-            ends = pd.Series({end: found[what, end] for end in ("value", "low", "high")})
-            texts.append(interval(ends if what.startswith("rank") else np.exp(ends), 2))
+            *ends, _ = over_worlds(some[what].to_numpy(), some["world"])
+            texts.append(interval(*(ends if what.startswith("rank") else np.exp(ends)), places=2))
         table.row(name, len(some), *texts)
 
 

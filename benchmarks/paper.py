@@ -1,4 +1,4 @@
-"""Test the claims of the paper with the paper's own method; prints the tables of docs/paper.md.
+"""Test the claims of the paper with the paper's own method; prints docs/evidence/paper.md.
 
     python benchmarks/paper.py worlds --data DIR
     python benchmarks/paper.py worlds --model coupled --kind right
@@ -25,8 +25,7 @@ import jax
 import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
-from groups import grounds_of
-from summary import bootstrap
+from groups import interval, over_worlds
 from world_set import COURSES, World, drawn, worlds
 
 import trustbo as tb
@@ -42,8 +41,9 @@ MODELS = {
 """Equations (3)-(4) and (1)-(2)."""
 NEAR = 5.0
 """Regret in % up to which a path is good enough."""
+MISSIONS = 8
 MAX_BOUNDS = "shortest+4"
-"""Paths among which the best one is looked for, as in benchmarks/worlds.py."""
+"""Paths among which the best one is looked for, the default of campaigns."""
 TERRAIN = {"size": (500.0, 500.0), "resolution": 1.0, "seed": 2}
 """Terrain of the notebook of the paper."""
 START, GOAL = (9, 0), (0, 9)
@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--kind", action="append", help="kind of worlds (default all)")
     parser.add_argument("--world", action="append", help="world (default all)")
     parser.add_argument("--course", action="append", choices=COURSES, help="default sw-ne")
-    parser.add_argument("--missions", type=int, default=8, help="per campaign (default 8)")
+    parser.add_argument("--missions", type=int, default=MISSIONS, help=f"default {MISSIONS}")
     parser.add_argument("--csv", type=Path, help="CSV file for the results of each campaign")
     given = parsed(parser)
 
@@ -219,8 +219,8 @@ def summarised(rows: pd.DataFrame, n_missions: int) -> pd.DataFrame:
     return pd.DataFrame(numbers)
 
 
-def report(numbers: pd.DataFrame, n_missions: int) -> None:
-    """Print means by method, and paired differences, with 95 % intervals over terrains."""
+def report(numbers: pd.DataFrame, n_missions: int = MISSIONS) -> None:
+    """Print means by method, and paired differences, with intervals of a t test by terrain."""
     n_worlds = numbers["world"].nunique()
     n_scenes = len(numbers[["world", "course"]].drop_duplicates())
     print(f"\n{n_worlds} worlds, {n_scenes} worlds and courses, {n_missions} missions each\n")
@@ -230,8 +230,7 @@ def report(numbers: pd.DataFrame, n_missions: int) -> None:
     for method in ("greedy, (6)", "random, (6)", "prior only, (6)",
                    "greedy, mean", "random, mean", "prior only, mean"):  # fmt: skip
         runs = numbers[numbers["method"] == method]
-        found = averaged({name: runs[name].to_numpy() for name in names}, runs["world"])
-        table.row(method, *(as_text(found, name) for name in names))
+        table.row(method, *(as_text(runs[name], runs["world"]) for name in names))
 
     print("\npaired differences\n")
     table = Table("difference", *names)
@@ -248,21 +247,14 @@ def differences(
     index = ["world", "course"]
     runs = [numbers[numbers["method"] == name].set_index(index)[names] for name in (one, other)]
     less = (runs[0] - runs[1]).dropna(how="all")
-    found = averaged(
-        {name: less[name].to_numpy() for name in names}, less.index.get_level_values("world")
-    )
-    table.row(f"{one} minus {other}", *(as_text(found, name) for name in names))
+    of_worlds = less.index.get_level_values("world")
+    table.row(f"{one} minus {other}", *(as_text(less[name], of_worlds) for name in names))
 
 
-def averaged(values: dict[str, np.ndarray], of_worlds: Any) -> dict[tuple[str, str], float]:
-    """Compute means and their 95 % intervals by a bootstrap over terrains."""
-    return bootstrap(values, grounds_of(of_worlds), np.nanmean)
-
-
-def as_text(found: dict[tuple[str, str], float], name: str) -> str:
-    """Format a mean with its interval."""
-    value, low, high = (found[name, what] for what in ("value", "low", "high"))
-    return "" if np.isnan(value) else f"{value:.3f} [{low:.3f}, {high:.3f}]"
+def as_text(values: pd.Series, of_worlds: Any) -> str:
+    """Write the mean of a measure over worlds, with its interval."""
+    *ends, _ = over_worlds(values.to_numpy(), of_worlds)
+    return interval(*ends)
 
 
 # --- priors and seconds ---
@@ -279,7 +271,8 @@ def notebook_workspace() -> tb.Workspace:
 def print_priors(n_draws: int = 2000, n_paths: int = 40) -> None:
     """Print how many prior-predictive contact rates are in [0, 1], and the first trust map."""
     workspace = notebook_workspace()
-    table = Table("prior", "rates in [0, 1]", "5 % to 95 % of rates", "first trust map, 5 draws")
+    table = Table("prior", "rates in [0, 1]", "5 % to 95 % of rates", "first trust map, 5 draws",
+                  name="paper_priors")  # fmt: skip
     for name, model in (("default", tb.models.PooledTrust()), ("for_cells", MODELS["pooled"])):
         rates = []
         maps = []
@@ -323,7 +316,8 @@ def print_seconds(n_missions: int = 8) -> None:
     finds its programs in JAX's cache of compiled programs.
     """
     workspace = notebook_workspace()
-    table = Table("campaign of eight missions with NUTS", "CPU time", "wall time")
+    table = Table("campaign of eight missions with NUTS", "CPU time", "wall time",
+                  name="paper_seconds")  # fmt: skip
     with TemporaryDirectory() as cache:
         jax.config.update("jax_compilation_cache_dir", cache)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -5,8 +5,7 @@
 The table contains CPU times in milliseconds, as medians of 5 runs. The reference planner on
 networkx runs once with fewer draws, and its time is scaled. Both planners must find the same values
 (tolerance 1e-9). Dijkstra's algorithm in scipy and networkx solves an easier problem: the costs in
-`planner.graph` do not depend on earlier bounds. To compare with version 0.3, run
-`tests/benchmarks/planning.py` of that version on the same machine.
+`planner.graph` do not depend on earlier bounds.
 """
 
 import time
@@ -114,7 +113,7 @@ def large(table, n, peers):
 
 def main():
     given = parsed(arguments(__doc__, quick="smaller maps"))
-    table = Table("", "ms", "note", first=52, others=12)
+    table = Table("", "ms", "note", first=52, others=12, name="planning")
     many_draws(table, 10, 20)
     many_draws(table, 100, 0)
     for n in (10, 50):

@@ -1,6 +1,6 @@
 """Simulation-based calibration of models, families and effects; prints the table of the docs.
 
-    python benchmarks/sbc.py [row ...] --sets 200 --jobs 16 --csv FILE
+    python benchmarks/sbc.py [row ...] --sets 200 --jobs 16
 
 Data sets are simulated from the prior, and each true parameter is ranked among posterior draws
 (Talts et al. 2018). If prior, likelihood and sampler are consistent, the ranks are uniform. Each
@@ -10,12 +10,9 @@ uniformity is rejected at the 1 % level, after Holm's correction for all tests. 
 model, add a row to `ROWS`.
 """
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
-from common import Table
+from common import Table, arguments, parsed
 from groups import holm
 from joblib import Parallel, delayed
 from scipy import stats
@@ -152,13 +149,11 @@ def part_of(name, n, seed):
 
 def main():
     """Compute the ranks in parallel, and print one row for each model."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("rows", nargs="*", choices=[*ROWS, []])
+    parser = arguments(__doc__ or "", names=ROWS)
     parser.add_argument("--sets", type=int, default=200, help="data sets per row (default 200)")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes (default 1)")
-    parser.add_argument("--csv", type=Path, help="CSV file to write the table to")
-    given = parser.parse_args()
-    names = given.rows or list(ROWS)
+    given = parsed(parser)
+    names = list(given.names)
 
     parts = -(-given.sets // PART)
     sizes = [min(PART, given.sets - PART * i) for i in range(parts)]
@@ -173,7 +168,16 @@ def main():
     p = [uniformity(r, N_RANKED) for ranks, _ in tests.values() for r in ranks.to_numpy().T]
     adjusted, first = holm(p), 0
     table = Table(
-        "row", "sets", "refused", "parameters", "least p", "of", "rejected", "50 %", "90 %"
+        "row",
+        "sets",
+        "refused",
+        "parameters",
+        "least p",
+        "of",
+        "rejected",
+        "50 %",
+        "90 %",
+        name="sbc",
     )
     for name, (ranks, refused) in tests.items():
         of_row = slice(first, first := first + ranks.shape[1])
@@ -187,8 +191,6 @@ def main():
             ranks.columns[least], int((adjusted[of_row] < LEVEL).sum()),
             f"{(off < 0.25).mean():.1%}", f"{(off < 0.45).mean():.1%}",
         )  # fmt: skip
-    if given.csv:
-        table.write(given.csv)
 
 
 if __name__ == "__main__":

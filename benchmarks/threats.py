@@ -12,8 +12,8 @@ missions are run, of which the first one cannot know it. The methods differ in h
 
 Missions have the same seeds in all methods. If a new campaign cannot learn from the missions so
 far, because its fit is refused, the last one goes on. The contact lost is in bounds per mission.
-Intervals are 95 %, by a bootstrap over terrains. The column "before" is the probability of a threat
-that is inferred before there is one.
+Intervals are those of a t test clustered by terrain. The column "before" is the probability of a
+threat that is inferred before there is one.
 """
 
 import sys
@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
-from groups import grounds_of, interval
-from lost import lost_in
-from summary import bootstrap
+from groups import interval, over_worlds
 from world_set import World, worlds
 
 import trustbo as tb
+from trustbo.data import POST_SETS
+from trustbo.study import lost_in
 
 METHODS = ("place effects", "contact", "sightings")
 BEFORE = 6
@@ -64,13 +64,12 @@ def main() -> None:
 
 def rows_of(world: World, course: str) -> list[dict[str, object]]:
     """Return a row for each method and each mission with the jammer."""
-    plain = world.workspace()
+    plain = world.workspace(n_posts=len(POST_SETS))
     workspace = plain.with_threat()
     ends = world.ends(course)
-    options: dict[str, Any] = {"planner": {"max_bounds": "shortest+4"}}
 
     usual = world.simulator(workspace)
-    first = tb.Campaign(workspace, *ends, seed=4, **options)
+    first = tb.Campaign(workspace, *ends, seed=4)
     for _ in first.run(usual, BEFORE):
         pass
     known = tb.planning.threat_map(first.missions, first.posterior, workspace)
@@ -83,7 +82,7 @@ def rows_of(world: World, course: str) -> list[dict[str, object]]:
     rows = []
     for method in METHODS:
         rng = np.random.default_rng(0)
-        here, campaign = workspace, again(first, workspace, ends, options)
+        here, campaign = workspace, again(first, workspace, ends)
         done = [*first.missions]
         for k in range(AFTER):
             simulator = world.simulator(here)
@@ -94,7 +93,7 @@ def rows_of(world: World, course: str) -> list[dict[str, object]]:
                 team=simulator.team,
                 events=[*simulator.events, jam],
             )
-            mission = simulator.run(campaign.ask().path, seed=100 + k, mission=BEFORE + k)
+            mission = simulator.run(campaign.ask().stations, seed=100 + k, mission=BEFORE + k)
             if method == "sightings":
                 x, y = np.array(center) + SIGHTED * rng.standard_normal(2)
                 sighting = tb.Sighting(float(x), float(y), SIGHTED)
@@ -108,16 +107,14 @@ def rows_of(world: World, course: str) -> list[dict[str, object]]:
                 rows[-1] |= {"probability": float(threat["probability"].sum())}
                 rows[-1] |= {"off": off(threat, here, center)}
                 with suppress(tb.TrustboError):
-                    campaign = again(campaign, plain.with_threat(threat), ends, options)
+                    campaign = again(campaign, plain.with_threat(threat), ends)
                     here = campaign.workspace
     return rows
 
 
-def again(
-    earlier: tb.Campaign, workspace: tb.Workspace, ends: Any, options: dict[str, Any]
-) -> tb.Campaign:
+def again(earlier: tb.Campaign, workspace: tb.Workspace, ends: Any) -> tb.Campaign:
     """Return a campaign that goes on from an earlier one, in a workspace with another threat."""
-    return tb.Campaign(workspace, *ends, seed=4, earlier=earlier, **options)
+    return tb.Campaign(workspace, *ends, seed=4, earlier=earlier)
 
 
 def off(threat: Any, workspace: tb.Workspace, center: tuple[float, float]) -> float:
@@ -140,16 +137,13 @@ def report(rows: pd.DataFrame) -> None:
     wide = known.pivot_table(index=["world", "course"], columns="method", values="lost")
     less = wide.sub(wide[METHODS[0]], axis=0).groupby("world").mean()
     print("\nminus place effects, missions 2 to 6\n")
-    found = bootstrap(
-        {name: less[name].to_numpy() for name in METHODS[1:]}, grounds_of(less.index), np.mean
-    )
-    columns = "p(threat)", "before", "off (m)"
-    table = Table("method", "difference [95 % by terrain]", *columns, first=26)
+    columns = "p", "p(threat)", "before", "off (m)"
+    table = Table("method", "difference [95 %]", *columns, first=26)
     for name in METHODS[1:]:
-        ends = pd.Series({what: found[name, what] for what in ("value", "low", "high")})
+        *ends, p = over_worlds(less[name].to_numpy(), less.index)
         about = rows[rows["method"] == name][["probability", "before", "off"]].mean()
-        texts = f"{about['probability']:.2f}", f"{about['before']:.2f}", f"{about['off']:.0f}"
-        table.row(name, interval(ends, 3), *texts)
+        shares = [f"{about[column]:.2f}" for column in ("probability", "before")]
+        table.row(name, interval(*ends), f"{p:.2g}", *shares, f"{about['off']:.0f}")
 
 
 if __name__ == "__main__":

@@ -137,13 +137,13 @@ def main():
     table = pd.DataFrame(rows)
     counts = ["logs", "failed", "wrong", "bounds", "few readings"]
     quantiles = {"median": 0.5, "95 %": 0.95, "largest": 1.0}
-    shown = Table("error of positions (m)", *counts, *(f"error of rates: {q}" for q in quantiles))
+    shown = Table("error of positions (m)", *counts, *(f"error of rates: {q}" for q in quantiles),
+                  name="tracks")  # fmt: skip
     groups = [*table.groupby("error of positions (m)").groups.items(), ("all", table.index)]
     for name, index in groups:
         of_group = np.quantile(np.concatenate([errors[i] for i in index]), [*quantiles.values()])
         total = table.loc[index, counts].sum()
         shown.row(name, *map(int, total), *(f"{error:.3f}" for error in of_group))
-    shown.write(given.out / "tracks.csv")
 
 
 if __name__ == "__main__":

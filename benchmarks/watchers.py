@@ -1,6 +1,6 @@
 """Predicted contact of robots, and of at least one and two of them, with robots at home.
 
-    python benchmarks/watchers.py --data DIR [--quick] [--csv FILE]
+    python benchmarks/watchers.py --data DIR [--quick]
 
 T2 has four robots. In each of ten missions on different paths, two of them take part, other ones
 each time. The default model is fitted to these missions. For new paths and for two, three or four
@@ -20,7 +20,6 @@ import itertools
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -50,7 +49,6 @@ BY_SIGHT = tb.models.TrustParams(0.3, np.array([0.2, 0.2, 0.6]), 0.0, 0.1, 0.1)
 
 def main() -> None:
     parser = arguments(__doc__ or "", data=True, quick="two worlds", names=WORLDS)
-    parser.add_argument("--csv", type=Path, help="CSV file for the rows")
     given = parsed(parser)
 
     every = worlds(given.data)
@@ -61,9 +59,6 @@ def main() -> None:
         rows += found
         covered += rates
         print(name, file=sys.stderr, flush=True)
-        if given.csv is not None:
-            given.csv.parent.mkdir(parents=True, exist_ok=True)
-            pd.DataFrame(rows).round(5).to_csv(given.csv, index=False)
     report(pd.DataFrame(rows), pd.DataFrame(covered))
 
 
@@ -193,12 +188,13 @@ def report(rows: pd.DataFrame, covered: pd.DataFrame) -> None:
     columns = [f"{what} rate" for what in of_shares[:3]]
     columns += [f"{what} {name}" for name in ("one", "two") for what in of_shares]
     for kind in ("world", "robots"):
-        table = Table(kind, "w", *columns, first=30)
+        table = Table(kind, "w", *columns, first=30, name=f"watchers_by_{kind}")
         for label, group in [*rows.groupby(kind, sort=False), ("all", rows)]:
             table.row(label, f"{group['w'].mean():.2f}", *errors_of(group))
         print()
 
-    table = Table("world", "covered", "r1", "r2", "r3", "r4", "was there", "was not", first=30)
+    table = Table("world", "covered", "r1", "r2", "r3", "r4", "was there", "was not", first=30,
+                  name="watchers_covered")  # fmt: skip
     for world, of_world in [*covered.groupby("world", sort=False), ("all", covered)]:
         by_robot = of_world.groupby("robot")["covered"].mean()
         by_there = of_world.groupby("was there")["covered"].mean()

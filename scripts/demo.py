@@ -29,13 +29,10 @@ from trustbo.plots.maps import (
     limits_of,
     shown_values,
 )
-from trustbo.plots.plan import draw_ground
-from trustbo.plots.style import GREY, ROBOTS, outlined
+from trustbo.plots.style import ROBOTS, outlined
 
 START, GOAL, MISSIONS = (9, 0), (0, 9), 8
 HEIGHT, RADIUS = 3.0, 45.0
-BOUND = 10
-"""Number of the bound of the new path that is drawn in panel (a), from 1."""
 ASPECT = 1.43
 """Width of a panel divided by its height, as for the hillside."""
 
@@ -83,22 +80,19 @@ def draw(
     center: tuple[float, float],
     file: Path,
 ) -> None:
-    """Draw a bound, the contact lost per mission, and trust and path before and after."""
+    """Draw the contact lost per mission, and trust and path before and after."""
     workspace = result.workspace
     right = tb.simulation.KinematicSimulator(workspace)
     known = tb.iterate(workspace, START, GOAL, n_iterations=MISSIONS, simulator=right)
 
     style = {"font.size": 9, "axes.titlesize": 10, "legend.frameon": False, "hatch.linewidth": 0.6}
     with mpl.rc_context(style):
-        figure, axes = plt.subplots(2, 2, figsize=(8.0, 6.8), layout="constrained")
-        figure.get_layout_engine().set(h_pad=0.08)
-        (bound, lost), maps = axes
-        draw_bound(bound, result.plan())
+        figure, (lost, *maps) = plt.subplots(1, 3, figsize=(9.6, 3.3), layout="constrained")
         draw_trust(figure, maps, result, center)
         worlds = {"old survey": (changed, result), "map is right": (right, known)}
         for colour, (label, world) in zip((ROBOTS[1], ROBOTS[0]), worlds.items(), strict=True):
             draw_lost(lost, *world, colour, label)
-        lost.set(title="(b) contact lost", xlabel="mission", ylabel="bounds of contact lost")
+        lost.set(title="(a) contact lost", xlabel="mission", ylabel="bounds of contact lost")
         lost.xaxis.set_major_locator(MaxNLocator(integer=True))
         lost.spines[["top", "right"]].set_visible(False)
         lost.set_ylim(bottom=0.0)
@@ -108,41 +102,13 @@ def draw(
     print(f"the picture is in {file}")
 
 
-def draw_bound(ax: Axes, plan: tb.planning.Plan) -> None:
-    """Draw one bound: T1 drives its route while T2 watches from overwatch points."""
-    corner = np.array(plan.workspace.grid.corner)
-    draw_ground(ax, plan.workspace)
-    route, *others = (one - corner for one in plan.routes[BOUND - 1])
-    posts = plan.posts[BOUND - 1] - corner
-    for share in (0.3, 0.65, 1.0):
-        ends = np.broadcast_to(route[round(share * (len(route) - 1))], posts.shape)
-        sight = ax.plot(*np.stack([posts, ends], 1).T, color=GREY, linewidth=1.3)
-    (moves,) = ax.plot(*route.T, color="black", linewidth=2.5)
-    (lead,) = ax.plot(*route[0], "*", color="black", markersize=13, linestyle="none")
-    ax.plot(*route[-1], "*", color="black", markersize=13, markerfacecolor="white")
-    for other in others:
-        (follows,) = ax.plot(*other.T, "--", color=ROBOTS[0], linewidth=1.2)
-    (watches,) = ax.plot(*posts.T, "o", color=ROBOTS[0], markersize=7, markeredgecolor="white")
-    seen = np.concatenate([route, posts, *others])
-    low, high = seen.min(0) - 2.0, seen.max(0) + 2.0
-    height = 1.4 * max(high[1] - low[1], (high[0] - low[0]) / ASPECT)  # with room for the legend
-    x = (low[0] + high[0] - ASPECT * height) / 2.0
-    ax.set(xlim=(x, x + ASPECT * height), ylim=(low[1], low[1] + height))
-    ax.set_title("(a) a bound")
-    legend = {
-        "T1, the lead": lead, "1. T1 moves": moves, "T2 at overwatch points": watches,
-        "T2 watches": sight[0], "2. T2 closes up": follows,
-    }  # fmt: skip
-    ax.legend(legend.values(), legend.keys(), loc="upper left", fontsize=8)
-    draw_scale(ax)
-
-
 def draw_trust(
-    figure: Figure, axes: np.ndarray, result: tb.Result, center: tuple[float, float]
+    figure: Figure, axes: list[Axes], result: tb.Result, center: tuple[float, float]
 ) -> None:
     """Draw trust map and path before the first and after the last mission, on one scale."""
     workspace = result.workspace
     maps = [result.history["trust_map"].sel(iteration=1), result.trust_map]
+    maps = [values.copy() for values in maps]
     for values in maps:
         values[START] = np.nan  # the trust at the start is assumed
     low, _ = limits_of(np.stack(maps), is_trust=True)
@@ -152,7 +118,7 @@ def draw_trust(
             driven[1, *bound.cell] = True
     norm = mpl.colors.Normalize(low, 1.0)  # 1: unbroken contact
     paths = [result.missions[0].path, result.path]
-    titles = ["(c) trust by the old map, first path", f"(d) after {MISSIONS} missions, new path"]
+    titles = ["(b) trust by the old map, first path", f"(c) after {MISSIONS} missions, new path"]
     x, y = np.array(center) - workspace.grid.corner
     for ax, values, known, path, title in zip(axes, maps, driven, paths, titles, strict=True):
         shown = shown_values(values, workspace)
@@ -180,7 +146,7 @@ def draw_lost(
     values = [truth.lost(mission.stations) for mission in result.missions]
     best = truth.lost(truth.best(START, GOAL))
     ax.plot(range(1, 1 + len(values)), values, "o-", color=colour, label=label)
-    ax.axhline(best, color=colour, linestyle=":", label=f"{label}: best path")
+    ax.axhline(best, color=colour, linestyle=":", label=f"best path, {label}")
     print(f"{label}: lost {np.round(values, 2)}, best {best:.2f}")
 
 

@@ -2,13 +2,15 @@
 
     python scripts/figures.py [--out docs/figures]
 
-`robot_trust.png` is drawn by the example of the page "Trust of one robot at one place", and
-`several_courses.png` shows the campaign of the page "Several courses on one ground".
+Some pages have figures of their examples. "Trust of one robot at one place", "Change a prior",
+"Your own model" and "Run a study in parallel" draw their own; those of "Planning", "Trust models"
+and "Several courses on one ground" are drawn here.
 """
 
 import argparse
 import contextlib
 import re
+import shutil
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,6 +21,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
@@ -29,7 +32,12 @@ from trustbo.plots.style import GREY, RC, outlined, robot_looks
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 EXAMPLE = DOCS / "howto" / "trust-of-one-robot-at-one-place.md"
+PRIOR = DOCS / "howto" / "change-a-prior.md"
+FUNCTION = DOCS / "howto" / "your-own-model.md"
 COURSES = DOCS / "howto" / "several-courses.md"
+MODELS = DOCS / "models.md"
+STUDY = DOCS / "howto" / "run-a-study-in-parallel.md"
+PLANNING = DOCS / "planning.md"
 START, GOAL = (9, 0), (0, 9)
 BOUND = 11
 """Number of the bound of the first plan that is drawn, from 1."""
@@ -41,6 +49,10 @@ REACHED = 3
 """Index of the cell in which T2 stands in the sketch."""
 POSTS = np.array([(-0.3, -0.3), (-0.1, 0.25), (0.35, 0.3)])
 """Posts in the sketch, from the centre of that cell, as fractions of a cell."""
+LOOKS = (("tab:red", "-"), ("black", "--"), ("tab:blue", "-."))
+"""Colour and style of the path by each objective."""
+LEAST = 1e-3
+"""Least probability of a threat on the colour scale."""
 DASHED = (0, (3, 1.5))
 OUTLINE = outlined(3.4, "white")
 
@@ -61,11 +73,21 @@ def main() -> None:
         save(overwatch(), out / "paper_overwatch.png")
         save(cloud(terrain), out / "paper_cloud.png")
 
-    run_example(EXAMPLE, out)  # saves robot_trust.png
-    with tempfile.TemporaryDirectory() as folder:
-        names = run_example(COURSES, Path(folder))
+    with tempfile.TemporaryDirectory() as folder:  # examples write other files, too
+        for page in (EXAMPLE, PRIOR, FUNCTION, STUDY):  # each saves one picture
+            run_example(page, Path(folder))
+        for picture in Path(folder).glob("*.png"):
+            shutil.copy(picture, out)
+            print(f"the picture is in {out / picture.name}")
+
+        of_courses = run_example(COURSES, Path(folder))
+        of_models = run_example(MODELS, Path(folder))
+        of_planning = run_example(PLANNING, Path(folder))
         with mpl.rc_context({**RC, "font.size": 9.0, "legend.fontsize": 9.0}):
-            save(courses(names), out / "several_courses.png")
+            save(courses(of_courses), out / "several_courses.png")
+            save(places(of_models), out / "place_effects.png")
+            save(objectives(of_planning), out / "objectives.png")
+            save(threat(of_planning), out / "threat.png")
 
 
 def run_example(page: Path, folder: Path) -> dict[str, Any]:
@@ -102,14 +124,9 @@ def courses(names: dict[str, Any]) -> Figure:
         look = {"ec": "white", "ls": ":", "lw": 1.5, "path_effects": outlined(3.0, "dimgrey")}
         ax.add_patch(Circle(centre, names["jammer"].radius, fill=False, **look))
         for path in paths:
-            places = np.array([workspace.grid.center(cell) for cell in path])
-            places -= workspace.grid.corner
             k = int(path[0] != ends[0][0])
-            look = {"color": ("tab:red", "black")[k], "zorder": 5, "path_effects": OUTLINE}
             style = "--" if paths is first else "-"
-            ax.plot(*places.T, style, lw=2.0, label=f"course {'AB'[k]}", **look)
-            ax.plot(*places[0], "o", ms=6, **look)
-            ax.plot(*places[-1], "*", ms=10, **look)
+            draw_path(ax, path, workspace, ("tab:red", "black")[k], style, f"course {'AB'[k]}")
 
     axes[0].set_title("before the first mission, with plans")
     axes[1].set_title("after four missions on A, with driven paths")
@@ -117,6 +134,71 @@ def courses(names: dict[str, Any]) -> Figure:
     unique = dict(zip(labels, handles, strict=True))
     figure.legend(unique.values(), unique, loc="outside lower center", ncols=2)
     return figure
+
+
+def places(names: dict[str, Any]) -> Figure:
+    """Draw the effect of a hollow and its estimates, in the bounds that were driven."""
+    workspace, place, s, e = (names[name] for name in ("workspace", "place", "s", "e"))
+    north, east = tb.workspace.MOVES.index((-1, 0)), tb.workspace.MOVES.index((0, 1))
+    driven = np.concatenate([e[north, :-1], e[east, -1:]])
+    driven[-1, 0] = np.nan  # where all missions start
+    shown = {"true effect": place[0], "estimate of $s$": s, "estimate of $s + e$": s + driven}
+
+    figure, axes = plt.subplots(1, 3, figsize=(7.6, 2.6), sharey=True, layout="compressed")
+    for ax, (title, values) in zip(axes, shown.items(), strict=True):
+        cells = xr.DataArray(values, dims=("row", "col"))
+        tb.plots.cell_map(cells, workspace, limits=(-0.3, 0.0), label="", ax=ax)
+        ax.set_title(title)
+        hollow = np.unravel_index(place[0].argmin(), place[0].shape)
+        centre = workspace.grid.center(hollow) - np.array(workspace.grid.corner)
+        look = {"color": "white", "fontsize": 8.0, "ha": "center", "va": "center"}
+        ax.text(*centre, f"{values[hollow]:.2f}", **look, path_effects=outlined(1.4, "black"))
+    figure.colorbar(axes[0].images[0], ax=list(axes), label="effect on the drift")
+    return figure
+
+
+def objectives(names: dict[str, Any]) -> Figure:
+    """Draw the best path by each objective on a map of the predicted trust."""
+    workspace = names["hill"]
+    trust = tb.Planner(workspace, START, GOAL).robot_maps(names["known"])["trust_mean"]
+    figure, ax = plt.subplots(figsize=(5.8, 4.2), layout="compressed")
+    tb.plots.cell_map(trust.mean("robot"), workspace, label="mean predicted trust", ax=ax)
+
+    for (name, plan), (colour, style) in zip(names["plans"].items(), LOOKS, strict=True):
+        draw_path(ax, plan.path, workspace, colour, style, label=name)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def threat(names: dict[str, Any]) -> Figure:
+    """Draw the probability of a threat in each cell, and the next path, before and after it."""
+    workspace, jam = names["plain"], names["jam"]
+    maps = [one["probability"].sum("reach") for one in names["threats"][-2:]]
+    paths = names["driven"].path, names["campaign"].ask().path
+    titles = "after mission 3, before the jammer", "after mission 4, with the jammer"
+
+    figure, axes = plt.subplots(1, 2, figsize=(7.6, 2.9), layout="compressed")
+    for ax, values, path, title in zip(axes, maps, paths, titles, strict=True):
+        tb.plots.cell_map(values, workspace, label="", cmap="Reds", ax=ax)
+        ax.images[0].set_norm(LogNorm(LEAST, 1.0, clip=True))
+        draw_path(ax, path, workspace, "black", "-")
+        centre = np.array(jam.center) - workspace.grid.corner
+        look = {"ec": "black", "ls": ":", "lw": 1.5, "path_effects": OUTLINE}
+        ax.add_patch(Circle(centre, jam.radius, fill=False, zorder=4, **look))
+        ax.set_title(title)
+    figure.colorbar(axes[1].images[0], ax=axes, extend="min", label="probability of a threat")
+    return figure
+
+
+def draw_path(
+    ax: Axes, path: Iterable[Any], workspace: tb.Workspace, colour: str, style: Any, label: str = ""
+) -> None:
+    """Draw a path through the centres of cells, from a circle to a star."""
+    places = np.array([workspace.grid.center(cell) for cell in path]) - workspace.grid.corner
+    look = {"color": colour, "zorder": 5, "path_effects": OUTLINE}
+    ax.plot(*places.T, linestyle=style, lw=2.0, label=label, **look)
+    ax.plot(*places[0], "o", ms=6, **look)
+    ax.plot(*places[-1], "*", ms=10, **look)
 
 
 def bound(plan: tb.planning.Plan, k: int = BOUND) -> Figure:

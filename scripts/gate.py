@@ -13,9 +13,10 @@ commit, and the digest of the code that ran; `benchmarks/closures` names that co
 command does not call does not count, and neither do comments, docstrings and layout.
 
 Entries must cover all files in `FILES`, and all tables of results in README and docs, which are the
-Markdown tables with a right-aligned column. `docs/worlds.md#the-tables` stands for all tables of a
-section, and `docs/worlds.md#the-tables: kind (worlds)` for those whose first column, of the columns
-with a title, has this title.
+Markdown tables with a right-aligned column. `docs/terrain.md#size` stands for all tables of a
+section, and `docs/terrain.md#size: cells` for those whose first column with a title has this title.
+The pages of the evidence are left out, as `benchmarks/tables.py` writes them from
+stored files.
 """
 
 import argparse
@@ -37,6 +38,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MANIFEST = "benchmarks/provenance.toml"
 CLOSURES = "benchmarks/closures"
 FILES = ("benchmarks/reference/*.csv", "docs/figures/*", "notebooks/*.ipynb")
+GENERATED = ("docs/evidence.md", "docs/evidence/*.md")
 
 
 class Entry(NamedTuple):
@@ -47,14 +49,12 @@ class Entry(NamedTuple):
     """Files, and sections or tables of pages."""
     run: str
     """Command that computes them."""
-    commit: str
+    commit: str = ""
     """Commit of the code that computed them, or with which a part was computed again."""
     digest: str = ""
     """Digest of the code that ran; "" if none was recorded."""
     part: str = ""
     """Command that computed a part of them again with this code; "" if all were computed."""
-    earlier: bool = False
-    """Whether they are of an earlier version, and kept for comparison; they are never stale."""
 
 
 def main() -> None:
@@ -110,6 +110,8 @@ def results_of(root: Path) -> Iterator[str]:
     for file in tracked(root):
         if any(fnmatch(file, pattern) for pattern in FILES):
             yield file
+        elif any(fnmatch(file, pattern) for pattern in GENERATED):
+            continue
         elif file == "README.md" or fnmatch(file, "docs/*.md"):
             yield from tables_of(file, (root / file).read_text())
 
@@ -128,13 +130,11 @@ def tables_of(page: str, text: str) -> Iterator[str]:
 
 def covers(shown: str, result: str) -> bool:
     """Return whether an item of an entry stands for a result."""
-    return result == shown or result.startswith(f"{shown}: ")
+    return fnmatch(result, shown) or result.startswith(f"{shown}: ")
 
 
 def why_stale(root: Path, entry: Entry) -> str:
     """Return why an entry is stale, or an empty text if it is not."""
-    if entry.earlier:
-        return ""
     if not entry.digest:
         return "nobody has recorded the code that computed it"
 

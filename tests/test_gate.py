@@ -1,6 +1,5 @@
 """The checks of tracked files and the gate fail on planted faults, and pass a clean repository."""
 
-import re
 import subprocess
 from pathlib import Path
 
@@ -159,6 +158,22 @@ def test_a_figure_or_stored_results_without_a_commit_are_listed(repository, name
     assert fault.startswith(f"{name}: ")
 
 
+def test_pages_that_are_written_from_stored_rows_need_no_entry(repository):
+    write(repository, "docs/evidence/contact.md", f"# Contact\n{TABLE}")
+    git(repository, "add", "--all")
+    assert list(gate.faults(repository)) == []
+
+
+def test_an_entry_may_stand_for_all_files_of_a_kind(repository):
+    for name in ("one", "two"):
+        write(repository, f"benchmarks/reference/contact/{name}.csv", "0.5\n")
+    text = (repository / gate.MANIFEST).read_text()
+    more = 'shows = ["benchmarks/reference/contact/*.csv", "README.md#results"'
+    write(repository, gate.MANIFEST, text.replace('shows = ["README.md#results"', more))
+    git(repository, "add", "--all")
+    assert list(gate.faults(repository)) == []
+
+
 def test_results_whose_code_was_never_recorded_are_listed(repository):
     write(repository, gate.MANIFEST, MANIFEST)
     [fault] = gate.faults(repository)
@@ -303,12 +318,3 @@ def test_lines_differ_if_a_number_does_by_more_than_rounding(before, after, diff
 def test_numbers_of_a_text_that_no_output_shows_are_found(text, found):
     unshown = compare_notebooks.unshown(small(text=text))
     assert [number for number, _ in unshown] == found
-
-
-def test_claims_of_the_readme_name_the_commits_of_their_entries():
-    page = (gate.ROOT / "docs" / "benchmarks.md").read_text()
-    claims = page.partition("## Claims of README\n")[2]
-    named = re.findall(r"\| `([\w-]+)`, ([0-9a-f]{8}) \|\n", claims)
-    commits = {entry.name: entry.commit for entry in gate.read_manifest(gate.ROOT)}
-    assert len(named) > 5
-    assert named == [(name, commits[name]) for name, _ in named]

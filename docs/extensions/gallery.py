@@ -24,7 +24,13 @@ _DPI = 110
 _NOTEBOOKS = (
     "Jupyter notebooks with their outputs; `make jupyter` installs JupyterLab and opens copies."
 )
-_PICTURES = {"compare_models": 4}
+_PICTURES = {
+    "1_quickstart": 1,
+    "2_paper_experiment": 2,
+    "3_paper_parameters": 3,
+    "4_own_model": 3,
+    "5_compare_models": 4,
+}
 """Index of the stored picture of a notebook that is shown; by default, the first one."""
 _START, _GOAL = (7, 0), (0, 5)
 _SCRUB = (2, 1)
@@ -147,7 +153,6 @@ def write_gallery(app: Sphinx) -> None:
 
     drawn = json.loads((FOLDER / "figures.json").read_text())
     paths = sorted((HERE.parent / "notebooks").glob("*.ipynb"))
-    paths.sort(key=lambda path: path.stem != "quickstart")  # the quickstart first
     notebooks = [_notebook(path) for path in paths]
     text = ["````{container} gallery", *(_figure(*entry) for entry in drawn), "````"]
     text += ["", "## Notebooks", "", _NOTEBOOKS, ""]

@@ -77,19 +77,15 @@ def test_a_small_world_is_measured_and_reported(calibration, monkeypatch, tmp_pa
     world = replace(worlds()["synthetic-1-one-poor"], shape=(4, 4), cell=40.0)
     courses = ["sw-ne"]
     calibration.store_paths([world], courses)
-    models = {
-        "default": lambda features: tb.models.default_model(),
-        "pooled": lambda features: tb.models.PooledTrust(),
-    }
-    rows = calibration.measure([world], courses, models, tmp_path / "out")
-    assert set(rows["model"]) == set(models)
+    rows = calibration.measure([world], courses, calibration.MODELS, tmp_path / "out")
+    assert set(rows["model"]) == set(calibration.MODELS)
     assert set(rows["set"]) == {"driven", "undriven", calibration.FIRST}
     assert rows.loc[rows["set"] == "driven", "poor_bias"].notna().any()
 
-    again = calibration.measure([world], courses, models, tmp_path / "out")
+    again = calibration.measure([world], courses, calibration.MODELS, tmp_path / "out")
     pd.testing.assert_frame_equal(rows, again)
     calibration.report(rows)
-    assert "pooled minus default" in capsys.readouterr().out
+    assert "default minus without effects" in capsys.readouterr().out
 
 
 def test_trust_is_that_of_the_planner(calibration):

@@ -1,7 +1,6 @@
-"""Groups and kinds of worlds: means, differences and p-values of results made by hand."""
+"""Groups and kinds of worlds, and the t test of all tables."""
 
 import os
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -14,102 +13,21 @@ from groups import (
     ALIKE,
     GROUPS,
     KINDS,
-    LOST,
-    OURS,
-    arrivals,
-    beside,
-    by_group,
-    by_kind,
-    by_limit,
     clustered,
     grounds_of,
+    groups_in,
     holm,
-    report_groups,
-    rows_of,
+    interval,
+    over_worlds,
 )
 from scipy import stats
 from world_set import worlds
-
-METHODS = (OURS, "running mean", "residual process", "line of sight")
-LOSES = {OURS: 0.1, "running mean": 0.3, "residual process": 0.2, "line of sight": 0.9}
-
-
-def made(lost):
-    """Rows of all worlds on two courses; `lost(method, world, course)`."""
-    rows = [
-        {
-            "world": world.name, "kind": world.kind, "course": course, "method": method,
-            "lost_while_learning": lost(method, world, course), "regret_now": 1.0, "arrive": 0.9,
-            LOST: lost(method, world, course), "arrive_first_3": 0.5, "arrive_later": 1.0,
-        }
-        for world in worlds().values() for course in ("sw-ne", "nw-se") for method in METHODS
-    ]  # fmt: skip
-    return pd.DataFrame(rows)
-
-
-def of_row(table, **labels):
-    some = table
-    for name, label in labels.items():
-        some = some[some[name] == label]
-    assert len(some) == 1
-    return some.iloc[0]
 
 
 def test_every_kind_of_world_is_in_one_of_the_groups():
     assert set(KINDS) == {world.kind for world in worlds().values()}
     assert sorted(kind for kinds in ALIKE.values() for kind in kinds) == sorted(KINDS)
     assert set(GROUPS["all but wrong slope limits"]) == set(KINDS) - {"limit"}
-
-
-def test_groups_have_the_means_of_their_worlds_and_the_best_baseline():
-    """Worlds differ by far more than methods do, and paired differences by nothing."""
-    levels = {world: 3.0 * i for i, world in enumerate(worlds())}
-    table = by_group(made(lambda method, world, course: LOSES[method] + levels[world.name]))
-    for group, kinds in GROUPS.items():
-        names = [world.name for world in worlds().values() if world.kind in kinds]
-        own = of_row(table, group=group, what=OURS)
-        assert own["n"] == len(names)
-        assert own["value"] == pytest.approx(0.1 + np.mean([levels[name] for name in names]))
-        assert own["low"] < own["value"] - 1.0
-        assert own["high"] > own["value"] + 1.0
-        best = of_row(table, group=group, what=f"{OURS} minus the best (residual process)")
-        assert best[["value", "low", "high"]].tolist() == pytest.approx([-0.1] * 3)
-        sight = of_row(table, group=group, what=f"{OURS} minus line of sight")
-        assert sight["value"] == pytest.approx(-0.8)
-
-
-def test_worlds_of_one_terrain_enter_an_interval_together():
-    """Differences that are a terrain's own: as wide as of as many values as terrains."""
-    terrains = sorted({world.ground for world in worlds().values()})
-    shift = dict(zip(terrains, np.linspace(-1.0, 1.0, len(terrains)), strict=True))
-    table = by_group(made(
-        lambda method, world, course: shift[world.ground] if method == OURS else 0.0
-    ))  # fmt: skip
-    row = of_row(table, group="all", what=f"{OURS} minus running mean")
-    sd = np.std([shift[world.ground] for world in worlds().values()])
-    assert (row["high"] - row["low"]) / (2 * 1.96) > 0.8 * sd / np.sqrt(len(terrains))
-
-
-def test_only_worlds_that_all_methods_have_are_compared():
-    rows = made(lambda method, world, course: LOSES[method] + 9.0 * (world.name == "tahoe"))
-    gone = (rows["world"] == "tahoe") & (rows["method"] == "running mean")
-    table = by_group(rows[~gone])
-    assert of_row(table, group="all", what=OURS)["value"] == pytest.approx(0.1)
-
-
-def test_each_kind_is_held_against_its_own_best_baseline():
-    def lost(method, world, course):
-        good = "line of sight" if world.kind == "right" else "running mean"
-        noise = np.random.default_rng([len(world.name), world.ground.encode()[-1]]).normal()
-        return 0.0 if method == good else 1.0 + 0.01 * noise if method == OURS else 2.0
-
-    table = by_kind(made(lost))
-    assert table["kind"].tolist() == list(KINDS)
-    assert of_row(table, kind="right")["best"] == "line of sight"
-    assert of_row(table, kind="days")["best"] == "running mean"
-    assert table["value"].to_numpy() == pytest.approx(1.0, abs=0.05)
-    assert (table["p_holm"] >= table["p"]).all()
-    assert (table["p_holm"] < 0.05).all()
 
 
 def test_p_values_of_unrelated_values_are_those_of_the_t_test():
@@ -151,62 +69,6 @@ def test_holm_corrects_as_by_hand_and_as_statsmodels_does():
     np.testing.assert_allclose(holm(p), multitest.multipletests(p, method="holm")[1])
 
 
-def test_rows_count_arrivals_of_the_first_three_missions_apart():
-    labels = {"world": "tahoe", "kind": "right", "course": "sw-ne", "method": OURS}
-    results = pd.DataFrame({
-        "case": OURS, "scene": "tahoe, sw-ne", "seed": [0, 1],
-        **{name: labels[name] for name in ("world", "kind", "course")},
-        "regret now": 1.0, "lost while learning": 2.0, "lost with failures": [4.0, 6.0],
-        "arrive": [3 / 5, 3 / 4], "arrive of the first 3": [1 / 3, 2 / 3], "arrive later": 1.0,
-    })  # fmt: skip
-    row = of_row(rows_of(results), **labels)
-    assert row[LOST] == 5.0
-    assert row["lost_while_learning"] == 2.0
-    assert row["arrive_first_3"] == pytest.approx((1 / 3 + 2 / 3) / 2)
-    assert row["arrive_later"] == 1.0
-    assert row["arrive"] == pytest.approx((3 / 5 + 3 / 4) / 2)
-    home = arrivals(rows_of(results))
-    assert home.loc[("right", OURS), "arrive_later"] == 1.0
-
-
-def test_an_earlier_version_is_compared_on_the_worlds_that_both_have():
-    rows = made(lambda method, world, course: 0.2)
-    before = made(lambda method, world, course: 0.5)
-    before = before[before["world"] != "tahoe"]
-    table = beside(rows, before)
-    assert of_row(table, what="right")["n"] == sum(w.kind == "right" for w in worlds().values()) - 1
-    assert of_row(table, what="right")["value"] == pytest.approx(-0.3)
-    assert of_row(table, what="limit")["0.5"] == pytest.approx(0.5)
-
-
-def test_wrong_limits_are_averaged_by_how_wrong_they_are():
-    rows = made(lambda method, world, course: 0.1 if world.case == "limit-low-3" else 0.6)
-    limits = by_limit(rows)
-    assert limits.index.levels[0].tolist() == ["limit-1", "limit-2", "limit-4", "limit-low-3"]
-    assert limits.loc[("limit-low-3", OURS), LOST] == pytest.approx(0.1)
-    assert limits.loc[("limit-2", OURS), LOST] == pytest.approx(0.6)
-
-
-def test_the_report_has_every_group_and_kind(capsys):
-    report_groups(made(lambda method, world, course: LOSES[method]))
-    text = capsys.readouterr().out
-    assert "| robots, weather, changes (" in text
-    assert text.count("| limit, ") == 2
-    assert all(f"| {kind} (" in text for kind in KINDS)
-
-
-def test_help_is_printed_without_reading_a_table(monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["groups.py", "--help"])
-    monkeypatch.setattr("sys.excepthook", sys.excepthook)  # which the script replaces
-    monkeypatch.setattr(pd, "read_csv", None)
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(groups.__file__, run_name="__main__")
-    assert ended.value.code == 0
-    found = capsys.readouterr().out
-    assert found.startswith("usage: groups.py")
-    assert "FILE" in found
-
-
 def test_a_script_ends_without_a_traceback_if_nothing_reads_its_output():
     """As all scripts that parse their arguments; groups.py itself takes long to import."""
     program = "from common import arguments, parsed; parsed(arguments('')); print(10**5 * 'row ')"
@@ -224,3 +86,26 @@ def test_a_script_ends_without_a_traceback_if_nothing_reads_its_output():
 def test_worlds_are_of_their_terrains():
     by_name = worlds()
     assert grounds_of(by_name).tolist() == [world.ground for world in by_name.values()]
+
+
+def test_limits_too_high_and_too_low_are_groups_of_their_own():
+    every = worlds().values()
+    table = pd.DataFrame({"kind": [w.kind for w in every], "case": [w.case for w in every]})
+    some = dict(groups_in(table))
+    assert set(some) == {*GROUPS, "limit too high", "limit too low"}
+    assert len(some["all"]) == len(table)
+    wrong = some["wrong slope limit"]
+    parts = [some["limit too high"], some["limit too low"]]
+    assert sorted(pd.concat(parts).index) == sorted(wrong.index)
+    assert set(parts[1]["case"]) == {"limit-low-3"}
+
+
+def test_values_that_are_missing_do_not_count():
+    names = ["synthetic-0", "synthetic-1", "wellington", "tahoe"]
+    values = np.array([0.1, np.nan, 0.4, 0.2])
+    expected = clustered(values[[0, 2, 3]], np.arange(3))
+    assert over_worlds(values, names) == pytest.approx(expected)
+    assert np.isnan(over_worlds(np.full(4, np.nan), names)).all()
+    assert interval(np.nan, np.nan, np.nan) == "-"
+    assert interval(0.25, np.nan, np.nan, 2) == "0.25 [-]"
+    assert interval(-0.0001, -0.5, 0.25, 2) == "0.00 [-0.50, 0.25]"

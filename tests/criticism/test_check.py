@@ -354,7 +354,7 @@ def test_all_models_of_the_how_to_are_checked():
             exec(block, namespace)
 
     workspace = namespace["workspace"]
-    for name in ("saturating", "by_robot", "field", "by_cell", "by_mission", "with_effects"):
+    for name in ("saturating", "by_robot", "by_cell", "by_mission", "with_effects"):
         campaign = tb.iterate(
             workspace, (4, 0), (0, 4), model=namespace[name], simulator=namespace["simulator"],
             n_iterations=3, fit={"draws": 300, "check": False}, progress=False,
