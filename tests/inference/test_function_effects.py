@@ -239,6 +239,7 @@ def test_a_campaign_learns_the_effects_and_resumes(campaign, tmp_path):
     assert set(maps.data_vars) >= {"trust_mean", "trust_sd"}
 
 
+@pytest.mark.slow  # gradients by differences take minutes
 def test_nuts_has_the_same_posterior(missions):
     """Means differ by at most 4 standard errors of their difference."""
     quiet = {"latent": False, "progress": False}

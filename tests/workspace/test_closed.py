@@ -22,7 +22,7 @@ def is_open(path, cells, bounds):
     return not {*path[1:]} & {*cells} and not taken & {frozenset(bound) for bound in bounds}
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(6))
 def test_plans_are_the_best_of_the_paths_that_are_open(seed):
     rng = np.random.default_rng(seed)
     ground = random_cells(2)
@@ -48,10 +48,10 @@ def test_plans_are_the_best_of_the_paths_that_are_open(seed):
     ]
     of_plan = value_of(PARAMS, ground, plan.path, "lost_contact", "gaussian", noise)
     assert of_plan == pytest.approx(max(values), abs=1e-9)
-    for path in every:
-        if path not in open_paths:
-            with pytest.raises(tb.TrustboError, match="closed"):
-                planner.evaluate(path, PARAMS)
+    closed_paths = [path for path in every if path not in open_paths]
+    for k in rng.permutation(len(closed_paths))[:20]:
+        with pytest.raises(tb.TrustboError, match="closed"):
+            planner.evaluate(closed_paths[k], PARAMS)
 
 
 def test_a_team_can_leave_a_closed_cell_and_not_enter_it():
