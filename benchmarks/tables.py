@@ -323,7 +323,7 @@ def between_marks(page: str, text: str) -> str:
     """Return a page with this text between the comments that mark its evidence."""
     before, begin, rest = page.partition(BEGIN)
     _, end, after = rest.partition(END)
-    return f"{before}{begin}\n\n{text}\n{end}{after}"
+    return f"{before}{begin}\n{text}{end}{after}"
 
 
 def stale(folder: Path = DOCS) -> list[str]:
