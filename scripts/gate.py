@@ -175,7 +175,8 @@ def record(root: Path, name: str, part: str = "") -> str:
     entries = {entry.name: entry for entry in read_manifest(root)}
     if name not in entries:
         sys.exit(f"{MANIFEST} has no entry {name!r}; it has {', '.join(entries)}")
-    if changes_of_code := git(root, "status", "--porcelain", "--", *closure.FOLDERS).strip():
+    code = [f"{folder}/*.py" for folder in closure.FOLDERS]  # not the results of other entries
+    if changes_of_code := git(root, "status", "--porcelain", "--", *code).strip():
         sys.exit(f"commit the code of {name} first; changed are\n{changes_of_code}")
 
     commit = git(root, "rev-parse", "--short=8", "HEAD").strip()
@@ -192,7 +193,8 @@ def record(root: Path, name: str, part: str = "") -> str:
 def _write_fields(manifest: Path, name: str, fields: dict[str, str]) -> None:
     """Write fields of an entry below its others; empty ones are left out."""
     before, head, after = manifest.read_text().partition(f"[{name}]\n")
-    own, rest = re.match(r"(.*?)(\n*^\[.*|\n*\Z)", after, flags=re.S | re.M).groups()
+    # Comments above the next entry are not a part of this one.
+    own, rest = re.match(r"(.*?)(\n*(?:^#.*\n|\n)*^\[.*|\n*\Z)", after, flags=re.M | re.S).groups()
     own = re.sub(rf"^({'|'.join(fields)}) = .*(\n|\Z)", "", own, flags=re.M).rstrip("\n")
     lines = [f"{key} = {json.dumps(value)}" for key, value in fields.items() if value]
     manifest.write_text(before + head + "\n".join([own, *lines]) + rest)

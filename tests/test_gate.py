@@ -240,6 +240,18 @@ def test_code_is_recorded_only_after_a_commit_and_a_command_that_succeeds(reposi
     assert list(gate.faults(repository)) == []
 
 
+def test_entries_are_recorded_one_after_another_and_keep_comments(repository):
+    """The results of the first are not committed when the second is computed."""
+    more = '[more]\nshows = ["README.md#results"]\nrun = "python src/model.py"\n'
+    write(repository, gate.MANIFEST, f"{MANIFEST}\n# More\n\n{more}")
+    commit(repository)
+    gate.record(repository, "results")
+    gate.record(repository, "more")
+    assert list(gate.faults(repository)) == []
+    above, _, below = (repository / gate.MANIFEST).read_text().partition("\n\n# More\n\n")
+    assert above.count("digest") == below.count("digest") == 1
+
+
 def test_a_part_that_was_run_again_is_recorded_beside_the_code(repository):
     write(repository, "src/model.py", CODE.replace("0.5", "5e-1 + 0.0"))
     commit(repository)
