@@ -12,8 +12,6 @@ The prior for a limit from a data sheet, the default, was calibrated on the synt
 a wrong slope limit. The tables show those on other terrains apart.
 """
 
-import warnings
-from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,9 +20,8 @@ import pandas as pd
 from common import Table, arguments, parsed
 from contact import SETTINGS, changing_courses
 from groups import interval, over_worlds
-from threadpoolctl import threadpool_limits
-from world_set import World, worlds
-from worlds_in_parallel import run_worlds
+from world_set import World, available
+from worlds_in_parallel import rows_of_worlds
 
 import trustbo as tb
 from trustbo.files import write_text
@@ -40,20 +37,6 @@ CASES: dict[str, tuple[Hazard, bool]] = {
 }
 """Prior of the hazard, and whether a failure costs the bounds of a shortest path."""
 _DECIMALS = 5
-
-
-def run_world(world: World, folder: Path) -> int:
-    """Plan all courses of a world in all cases, unless it has a file; return 1 if it had none."""
-    file = folder / f"{world.name}.csv"
-    if file.exists():
-        return 0
-
-    with warnings.catch_warnings(), threadpool_limits(1):
-        warnings.simplefilter("ignore")  # of bounds without contact
-        rows = pd.DataFrame(rows_of(world)).round(_DECIMALS)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(file, rows.to_csv(index=False))
-    return 1
 
 
 def rows_of(world: World) -> Iterator[dict[str, Any]]:
@@ -80,17 +63,6 @@ def rows_of(world: World) -> Iterator[dict[str, Any]]:
                     "best_arrives": truth.p_arrive(best),
                     "excess": truth.lost_or_failed(plan.path) - truth.lost_or_failed(best),
                 }  # fmt: skip
-
-
-def run(given: Namespace) -> pd.DataFrame:
-    """Plan in all worlds for which there are data; return all rows."""
-    some = [world for world in worlds(given.data).values() if given.data or world.is_packaged]
-    if given.quick:
-        some = some[:2]
-    errors = run_worlds(run_world, some, given.jobs, given.out)
-    if errors:
-        raise SystemExit("\n".join(["plans are missing:", *errors]))
-    return pd.concat([pd.read_csv(given.out / f"{world.name}.csv") for world in some])
 
 
 # --- tables ---
@@ -156,7 +128,8 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=-1, help="processes, default one per core")
     parser.add_argument("--csv", type=Path, help="CSV file for the means by world")
     given = parsed(parser)
-    means = means_of(run(given))
+    some = list(available(given.data).values())[: 2 if given.quick else None]
+    means = means_of(rows_of_worlds(rows_of, some, given.jobs, given.out))
     if given.csv is not None:
         write_text(given.csv, means.to_csv(index=False))
     report(means)

@@ -45,10 +45,10 @@ import pandas as pd
 from common import Table, arguments, parsed
 from groups import ALIKE, interval, over_worlds
 from scipy.special import ndtr
-from world_set import World, worlds
+from world_set import World, available
 
 import trustbo as tb
-from trustbo.data import POST_SETS, Station
+from trustbo.data import Station
 from trustbo.files import write_text
 from trustbo.models.draws import Draws
 from trustbo.planning.recursion import trust_recursion
@@ -131,9 +131,8 @@ def main() -> None:
     given = parsed(parser)
 
     courses = COURSES[:1] if given.quick else COURSES
-    every = worlds(given.data)
-    names = SMALL if given.quick else WORLDS
-    chosen = [every[name] for name in names if given.data or every[name].is_packaged]
+    every = available(given.data)
+    chosen = [every[name] for name in (SMALL if given.quick else WORLDS) if name in every]
     if given.paths:
         store_paths(chosen, courses)
         return
@@ -147,11 +146,6 @@ def main() -> None:
 def rows_in(file: Path) -> pd.DataFrame:
     """Return stored rows."""
     return pd.read_csv(file, dtype={"stratum": str})
-
-
-def workspace_of(world: World) -> tb.Workspace:
-    """Return the assumed workspace of a world, with the default number of sets of posts."""
-    return world.workspace(n_posts=len(POST_SETS))
 
 
 # --- paths ---
@@ -169,7 +163,7 @@ def store_paths(chosen: Sequence[World], courses: Sequence[str]) -> None:
 
 def paths_of(world: World, course: str) -> list[dict[str, Any]]:
     """Run the default campaign of a world and course; return the rows of its paths."""
-    workspace = workspace_of(world)
+    workspace = world.campaign_workspace()
     simulator = world.simulator(workspace)
     campaign = tb.Campaign(workspace, *world.ends(course), seed=0)
     rng = np.random.default_rng(0)
@@ -234,7 +228,7 @@ def data_of(world: World, course: str, folder: Path) -> Data:
     }
     seeds = dict(zip(stored["mission"], stored["seed"], strict=True))
 
-    simulator = world.simulator(workspace_of(world))
+    simulator = world.simulator(world.campaign_workspace())
     missions = [
         without_ticks(simulator.run(paths[f"{j}"], seed=int(seeds[f"{j}"]), mission=j))
         for j in range(MISSIONS)
@@ -302,7 +296,7 @@ def lost_on(world: World, course: str, path: Sequence[Station], folder: Path) ->
     known = joblib.load(file) if file.exists() else {}
     text = text_of(path)
     if text not in known:
-        simulator = world.simulator(workspace_of(world))
+        simulator = world.simulator(world.campaign_workspace())
         runs = replicates(simulator, path, N_OF_PLANNED, SEEDS["first"], 0)
         n_done = np.isfinite(runs.rates).sum(0)
         mean = np.nansum(runs.rates, axis=0) / np.where(n_done, n_done, np.nan)
@@ -323,7 +317,7 @@ def measure(
     for world in chosen:
         for course in courses:
             data = data_of(world, course, folder)
-            workspace_of(world)  # is kept, and not part of the time of fits
+            world.campaign_workspace()  # is kept, and not part of the time of fits
             for name, make in models.items():
                 model = make()
                 started = time.process_time()
@@ -341,7 +335,7 @@ def measure(
 
 def rows_of_fit(world: World, data: Data, model: Any) -> list[dict[str, Any]]:
     """Fit a model, and return its rows for each set and stratum."""
-    workspace = workspace_of(world)
+    workspace = world.campaign_workspace()
     posterior = tb.fit(
         data.missions, model, workspace=workspace, seed=1, latent=False, progress=False
     )
@@ -386,7 +380,7 @@ def poor_robots(world: World) -> list[int]:
 
 def rows_before(world: World, course: str, model: Any, folder: Path) -> list[dict[str, Any]]:
     """Return the row of measures before any mission."""
-    workspace = workspace_of(world)
+    workspace = world.campaign_workspace()
     campaign = tb.Campaign(workspace, *world.ends(course), model=model, seed=0)
     plan = campaign.ask()
     lost = lost_on(world, course, plan.stations, folder)
@@ -497,7 +491,10 @@ def in_strata(truth: np.ndarray, measures: Mapping[str, np.ndarray]) -> list[dic
 
 
 def by_world(rows: pd.DataFrame) -> pd.DataFrame:
-    """Average over courses, weighted by the number of rates; the index has no course."""
+    """Average over courses, weighted by the number of rates.
+
+    Worlds with few rates in a stratum are left out of it.
+    """
     group_of = {kind: group for group, kinds in ALIKE.items() for kind in kinds}
     keys = ["model", "set", "stratum", "group", "world"]
     rows = rows.assign(group=rows["kind"].map(group_of))
@@ -507,13 +504,13 @@ def by_world(rows: pd.DataFrame) -> pd.DataFrame:
     labels = [rows[key] for key in keys]
     totals = weights.groupby(labels, sort=False).sum()
     means = (values * weights).groupby(labels, sort=False).sum() / totals.where(totals > 0)
-    return means.assign(n=rows.groupby(keys, sort=False)["n"].sum()).reset_index()
+    means = means.assign(n=rows.groupby(keys, sort=False)["n"].sum()).reset_index()
+    return means[(means["stratum"] == "all") | (means["n"] >= LEAST)]
 
 
 def report(rows: pd.DataFrame) -> None:
     """Print Markdown tables of means over worlds, and of paired differences between models."""
     found = by_world(rows)
-    found = found[(found["stratum"] == "all") | (found["n"] >= LEAST)]
     models = list(dict.fromkeys(rows["model"]))
     learned = found[found["set"] != FIRST]
 

@@ -29,12 +29,12 @@ from baselines import line_of_sight, residual_process, running_mean
 from baselines.paths import PathPolicy
 from common import arguments, parsed
 from threadpoolctl import threadpool_limits
-from world_set import World, worlds
+from world_set import World, available, worlds
 from world_set.world import drawn
 from worlds_in_parallel import run_worlds
 
 import trustbo as tb
-from trustbo.data import POST_SETS, Cell
+from trustbo.data import Cell
 from trustbo.errors import TrustboError
 from trustbo.files import write_text
 from trustbo.study import lost_in
@@ -123,7 +123,7 @@ def campaign_of(
     policy = None if make is None else make()
     options = {} if policy is None else {"policy": policy, "model": tb.models.PooledTrust()}
     courses = courses_of(world, setting, which, n)
-    workspace = world.workspace(n_posts=len(POST_SETS))
+    workspace = world.campaign_workspace()
     simulator = world.simulator(workspace)
     campaign = tb.Campaign(workspace, seed=0, progress=False, **options)
 
@@ -156,8 +156,12 @@ def seed_of(which: str, mission: int) -> int:
 
 def file_of(folder: Path, world: str, setting: str, which: str, method: str) -> Path:
     """Return the file of the row of a campaign."""
-    name = f"{setting} {which} {method}.csv".replace(", ", "-").replace(" ", "_")
-    return folder / world / name
+    return folder / world / file_name(setting, which, method)
+
+
+def file_name(*parts: str) -> str:
+    """Return the name of a CSV file of rows, without spaces and commas."""
+    return f"{' '.join(parts)}.csv".replace(", ", "-").replace(" ", "_")
 
 
 def run_world(
@@ -204,8 +208,7 @@ def rows_in(folder: Path, setting: str, method: str, names: Sequence[str]) -> pd
 
 def run(given: Namespace) -> None:
     """Run the campaigns that the arguments of the command line ask for, and store all rows."""
-    every = worlds(given.data)
-    some = [world for world in every.values() if given.data or world.is_packaged]
+    some = list(available(given.data).values())
     if given.world:
         some = [world for world in some if world.name in given.world]
     n_missions = MISSIONS
@@ -219,7 +222,7 @@ def run(given: Namespace) -> None:
     errors = run_worlds(run_world, some, given.jobs, *shared)
 
     if given.csv is not None:
-        write_rows(given.out, given.csv, list(every))
+        write_rows(given.out, given.csv, list(worlds()))
     if errors:
         raise SystemExit("\n".join(["campaigns are missing:", *errors]))
 
@@ -231,8 +234,9 @@ def write_rows(folder: Path, csv: Path, names: Sequence[str]) -> None:
             rows = rows_in(folder, setting, method, names)
             if len(rows):
                 csv.mkdir(parents=True, exist_ok=True)
-                name = f"{setting} {method}.csv".replace(", ", "-").replace(" ", "_")
-                write_text(csv / name, rows.round(_STORED).to_csv(index=False))
+                write_text(
+                    csv / file_name(setting, method), rows.round(_STORED).to_csv(index=False)
+                )
 
 
 def main() -> None:

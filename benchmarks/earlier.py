@@ -21,10 +21,9 @@ import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
 from groups import interval, over_worlds
-from world_set import World, worlds
+from world_set import World, available
 
 import trustbo as tb
-from trustbo.data import POST_SETS
 from trustbo.files import write_text
 from trustbo.study import lost_in
 
@@ -64,8 +63,7 @@ def main() -> None:
     parser.add_argument("--csv", type=Path, help="CSV file for the rows")
     given = parsed(parser)
 
-    every = worlds(given.data)
-    known = {n: world for n, world in every.items() if given.data or world.is_packaged}
+    known = available(given.data)
     chosen = [name for name in PAIRS if name in known and PAIRS[name] in known]
     rows = []
     for name in chosen[:2] if given.quick else chosen:
@@ -108,7 +106,7 @@ def earlier(world: World, out: Path) -> Any:
 
 def run(world: World, course: str, n: int, **options: Any) -> Any:
     """Run a campaign in a world."""
-    workspace = world.workspace(n_posts=len(POST_SETS))
+    workspace = world.campaign_workspace()
     return tb.iterate(
         workspace,
         *world.ends(course),

@@ -12,7 +12,7 @@ import warnings
 
 import numpy as np
 from common import Table, arguments, parsed
-from world_set import worlds
+from world_set import available
 
 from trustbo.simulation.replicates import replicated
 from trustbo.workspace.difficulty import MEASURES
@@ -25,12 +25,10 @@ LOOKAHEADS = (0.5, 3.0)
 def print_separation(given):
     """Print the area under the ROC curve of the predicted tilt as a sign of failure, by world.
 
-    The tilt is that of the route, or that of the driven curve, and that of the
-    true next move, or that of the next move in the same direction. An area of .5 means that it says
-    nothing about failures.
+    The tilt is that of the route or of the driven curve, with the true next move or with one in the
+    same direction. An area of .5 means that it says nothing about failures.
     """
-    chosen = [w for w in worlds(given.data).values() if w.case == "limit-2"]
-    chosen = [world for world in chosen if given.data or world.is_packaged]
+    chosen = [w for w in available(given.data).values() if w.case == "limit-2"]
     columns = ["route, straight on", "route", "curve, straight on", "curve"]
     others = [f"curve, {ahead:g} m" for ahead in LOOKAHEADS]
     table = Table("world", "passed", *columns, *others, name="tilt")
@@ -110,10 +108,7 @@ def area_under(tilt, passed):
 
 
 def main():
-    parser = arguments(
-        __doc__, data=True, quick="one world"
-    )  # fmt: skip
-    given = parsed(parser)
+    given = parsed(arguments(__doc__, data=True, quick="one world"))
     warnings.simplefilter("ignore")
     print_separation(given)
 

@@ -15,7 +15,7 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from calibration import LEAST, STRATA, by_world, rows_in
+from calibration import STRATA, by_world, rows_in
 from common import arguments, parsed
 from contact import MISSIONS
 from groups import ALIKE, over_worlds
@@ -43,7 +43,7 @@ OF_PAPER = {
 }
 """Columns of the rows of `paper.py` that are drawn, and their titles."""
 _FARTHEST = 1.0
-"""Largest difference that is drawn; dots beyond it are named at the edge."""
+"""Largest difference that is drawn; dots beyond it are drawn there."""
 _BINS = (0.01, 0.03, 0.1, 0.3)
 """Limits of the predicted probability of failure in the figure of arrivals."""
 _RANGE = (1e-3, 1.0)
@@ -134,7 +134,6 @@ def arrivals() -> Figure:
 def intervals() -> Figure:
     """Draw the coverage and width of 90 % intervals of trust, by true rate and by model."""
     found = by_world(rows_in(STORED / "calibration.csv"))
-    found = found[(found["stratum"] == "all") | (found["n"] >= LEAST)]
     figure, axes = plt.subplots(
         2, 2, figsize=(PAGE, 3.6), sharex=True, sharey="row", layout="constrained"
     )

@@ -43,7 +43,6 @@ from scipy import stats
 from world_set import worlds
 
 import trustbo as tb
-from trustbo.data import POST_SETS
 from trustbo.inference.diagnostics import complaints_of
 from trustbo.inference.functions.data import arrays_of, data_of
 from trustbo.inference.functions.draws import draws_of_drift, function_drift
@@ -199,7 +198,7 @@ def as_default():
     rows = []
     for name in WORLDS:
         world = worlds()[name]
-        workspace = world.workspace(n_posts=len(POST_SETS))
+        workspace = world.campaign_workspace()
         row = {"world": name}
         for label, model in {"default": None, "function": default_as_function}.items():
             started = time.process_time()
@@ -495,7 +494,7 @@ if __name__ == "__main__":
     calls = {
         "campaign": lambda: campaign(given.seeds),
         "own_campaign": lambda: own_campaign(given.functions or OF_CAMPAIGNS),
-        "as_default": lambda: as_default(),
+        "as_default": as_default,
         "program": lambda: program(given.seeds),
         "samplers": lambda: samplers(given.functions or SHORT + (SLOW if given.slow else ())),
         "sbc": lambda: sbc(given.functions or CALIBRATED, given.sets),

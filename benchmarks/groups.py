@@ -25,6 +25,16 @@ GROUPS = {
 """Kinds of worlds in each group, keyed by the name of the group."""
 
 
+LIMITS = ("limit too high", "limit too low")
+"""Names of the parts of the group of wrong slope limits."""
+
+
+def require_group(name: str) -> None:
+    """Raise ValueError if no group, part of one or kind of worlds has this name."""
+    if name not in (*GROUPS, *LIMITS, *KINDS):
+        raise ValueError(f"there is no group or kind of worlds {name!r}.")
+
+
 def groups_in(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """Yield the groups of worlds that a table has, and limits too high and too low apart.
 
@@ -32,7 +42,7 @@ def groups_in(table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """
     is_limit = table["kind"] == "limit"
     is_low = table["case"].str.contains("low")
-    limits = {"limit too high": is_limit & ~is_low, "limit too low": is_limit & is_low}
+    limits = dict(zip(LIMITS, (is_limit & ~is_low, is_limit & is_low), strict=True))
     chosen = {}
     for name, kinds in GROUPS.items():
         chosen[name] = table["kind"].isin(kinds)

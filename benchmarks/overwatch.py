@@ -21,7 +21,7 @@ import pandas as pd
 from common import Table, arguments, parsed
 from groups import ALIKE, interval, over_worlds
 from scipy.stats import rankdata
-from world_set import World, worlds
+from world_set import World, available
 
 from trustbo.data import POST_SETS, Cell
 from trustbo.simulation import KinematicSimulator
@@ -42,8 +42,7 @@ def main() -> None:
     parser.add_argument("--csv", type=Path, help="CSV file for the rows")
     given = parsed(parser)
 
-    chosen = [w for w in worlds(given.data).values() if w.kind in KINDS and not w.radio]
-    chosen = [w for w in chosen if given.data or w.is_packaged]
+    chosen = [w for w in available(given.data).values() if w.kind in KINDS and not w.radio]
     rows = [row for world in chosen[:: len(chosen) // 4 if given.quick else 1] for row in of(world)]
     table = pd.DataFrame(rows)
     if given.csv is not None:
@@ -54,7 +53,7 @@ def main() -> None:
 
 def of(world: World) -> Iterator[dict[str, object]]:
     """Yield a row with the scores and the contact of each set of posts in each bound."""
-    workspace = world.workspace(n_posts=len(POST_SETS))
+    workspace = world.campaign_workspace()
     simulator = world.simulator(workspace)
     if not isinstance(simulator, KinematicSimulator):
         return

@@ -26,7 +26,7 @@ import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
 from groups import interval, over_worlds
-from world_set import COURSES, World, drawn, worlds
+from world_set import COURSES, World, available, drawn
 
 import trustbo as tb
 from trustbo.campaign.choose import informed_planner
@@ -80,9 +80,8 @@ def run_worlds(given: Any) -> pd.DataFrame:
     """Run or read the campaigns of all chosen worlds and courses; return a row for each mission."""
     chosen = [
         world
-        for world in worlds(given.data).values()
-        if (given.data or world.is_packaged)
-        and (given.kind is None or world.kind in given.kind)
+        for world in available(given.data).values()
+        if (given.kind is None or world.kind in given.kind)
         and (given.world is None or world.name in given.world)
     ]
 

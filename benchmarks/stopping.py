@@ -13,8 +13,7 @@ Before the first mission, the 90 % band of the first plan is compared with the t
 Each world has a file in --out, so a run that was stopped continues where it was.
 """
 
-import warnings
-from argparse import Namespace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,8 @@ import pandas as pd
 from common import Table, arguments, parsed
 from contact import SETTINGS
 from groups import groups_in, kinds_in
-from threadpoolctl import threadpool_limits
-from world_set import World, worlds
-from worlds_in_parallel import run_worlds
+from world_set import World, available
+from worlds_in_parallel import rows_of_worlds
 
 import trustbo as tb
 from trustbo.files import write_text
@@ -34,18 +32,10 @@ EPS, DELTA = 0.05, 0.1
 RULE = tb.RegretBound(eps=EPS, delta=DELTA)
 
 
-def run_world(world: World, folder: Path) -> int:
-    """Run the campaigns of a world unless it has a file; return how many."""
-    file = folder / f"{world.name}.csv"
-    if file.exists():
-        return 0
-
-    with warnings.catch_warnings(), threadpool_limits(1):
-        warnings.simplefilter("ignore")  # of risk, and of bounds without contact
-        rows = [stopped_campaign(world, course) for course in SETTINGS["one"]]
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(file, pd.DataFrame(rows).round(4).to_csv(index=False))
-    return len(rows)
+def rows_of(world: World) -> Iterator[dict[str, Any]]:
+    """Yield the row of each campaign of a world."""
+    for course in SETTINGS["one"]:
+        yield stopped_campaign(world, course)
 
 
 def stopped_campaign(world: World, course: str) -> dict[str, Any]:
@@ -87,23 +77,13 @@ def report(rows: pd.DataFrame) -> None:
         )  # fmt: skip
 
 
-def run(given: Namespace) -> pd.DataFrame:
-    """Run all campaigns; return their rows."""
-    some = [world for world in worlds(given.data).values() if given.data or world.is_packaged]
-    if given.quick:
-        some = some[:2]
-    errors = run_worlds(run_world, some, given.jobs, given.out)
-    if errors:
-        raise SystemExit("\n".join(["campaigns are missing:", *errors]))
-    return pd.concat([pd.read_csv(given.out / f"{world.name}.csv") for world in some])
-
-
 def main() -> None:
     parser = arguments(__doc__ or "", data=True, out="out/stopping", quick="two worlds")
     parser.add_argument("--jobs", type=int, default=-1, help="processes, default one per core")
     parser.add_argument("--csv", type=Path, help="CSV file for the rows")
     given = parsed(parser)
-    rows = run(given)
+    some = list(available(given.data).values())[: 2 if given.quick else None]
+    rows = rows_of_worlds(rows_of, some, given.jobs, given.out)
     if given.csv is not None:
         write_text(given.csv, rows.to_csv(index=False))
     report(rows)

@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 from common import arguments, parsed
 from contact import METHODS, MISSIONS, REFERENCE, SETTINGS
-from groups import grounds_of, groups_in, holm, interval, kinds_in, over_worlds
+from groups import grounds_of, groups_in, holm, interval, kinds_in, over_worlds, require_group
 
 ROOT = Path(__file__).parents[1]
 TEXTS = Path(__file__).parent / "pages"
@@ -48,10 +48,16 @@ _HOLE = re.compile(r"\{\{(.*?)\}\}", re.S)
 
 
 def rows_of(setting: str) -> pd.DataFrame:
-    """Read the rows of a setting, with the contact lost in all, the first and the last missions."""
-    files = sorted(REFERENCE.glob(f"{setting}_*.csv"))
+    """Return the rows of a setting, with the contact lost in all, the first and last missions."""
+    return _rows_in(REFERENCE, setting)
+
+
+@cache
+def _rows_in(folder: Path, setting: str) -> pd.DataFrame:
+    """Read the rows of a setting once, although a page shows many numbers of them."""
+    files = sorted(folder.glob(f"{setting}_*.csv"))
     if not files:
-        raise FileNotFoundError(f"there are no rows of the setting {setting!r} in {REFERENCE}.")
+        raise FileNotFoundError(f"there are no rows of the setting {setting!r} in {folder}.")
     rows = pd.concat([pd.read_csv(file) for file in files], ignore_index=True)
     lost = rows[[f"lost_{k + 1}" for k in range(MISSIONS)]].to_numpy()
     arrived = [[sign == "." for sign in status] for status in rows["status"]]
@@ -162,6 +168,7 @@ def _pairs(setting: str, one: str, other: str, title: str, text: Callable[[float
 
 def _group(setting: str, group: str, quantity: str = "lost") -> pd.DataFrame:
     """Return the worlds of a group or kind, with a column for each method."""
+    require_group(group)
     table = of_worlds(rows_of(setting), quantity)
     found = dict([*groups_in(table), *kinds_in(table)])
     if group not in found:
@@ -229,7 +236,6 @@ def _table(name: str) -> pd.DataFrame:
     return pd.read_csv(STORED / "tables" / f"{name}.csv", dtype=str, keep_default_na=False)
 
 
-@cache
 def reported(script: str, *files: str) -> str:
     """Return what the `report` of a script prints for stored rows."""
     module = import_module(script)

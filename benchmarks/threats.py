@@ -26,10 +26,9 @@ import numpy as np
 import pandas as pd
 from common import Table, arguments, parsed
 from groups import interval, over_worlds
-from world_set import World, worlds
+from world_set import World, available
 
 import trustbo as tb
-from trustbo.data import POST_SETS
 from trustbo.study import lost_in
 
 METHODS = ("place effects", "contact", "sightings")
@@ -49,8 +48,8 @@ def main() -> None:
     parser.add_argument("--csv", type=Path, help="CSV file for the rows")
     given = parsed(parser)
 
-    every = [w for w in worlds(given.data).values() if w.kind in ("right", "aged") and not w.radio]
-    every = [w for w in every if given.data or w.is_packaged]
+    known = available(given.data).values()
+    every = [w for w in known if w.kind in ("right", "aged") and not w.radio]
     rows = []
     for world in every[:2] if given.quick else every:
         for course in given.course or ("sw-ne", "nw-se"):
@@ -64,7 +63,7 @@ def main() -> None:
 
 def rows_of(world: World, course: str) -> list[dict[str, object]]:
     """Return a row for each method and each mission with the jammer."""
-    plain = world.workspace(n_posts=len(POST_SETS))
+    plain = world.campaign_workspace()
     workspace = plain.with_threat()
     ends = world.ends(course)
 

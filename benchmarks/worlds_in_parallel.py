@@ -2,11 +2,53 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from joblib import Parallel, delayed, parallel_config
+from threadpoolctl import threadpool_limits
 from world_set import World
+
+from trustbo.files import write_text
+
+_DECIMALS = 5
+
+type Rows = Iterable[Mapping[str, Any]]
+
+
+def rows_of_worlds(
+    rows_of: Callable[[World], Rows], some: Sequence[World], n_jobs: int, folder: Path
+) -> pd.DataFrame:
+    """Return the rows that `rows_of` yields for each world.
+
+    Each world has a file in the folder, so a run that was stopped continues where it was. Exits if
+    there was an error in a world, after all others.
+    """
+    errors = run_worlds(_write_rows, some, n_jobs, rows_of, folder)
+    if errors:
+        raise SystemExit("\n".join(["rows are missing:", *errors]))
+    return pd.concat([pd.read_csv(_file_of(world, folder)) for world in some], ignore_index=True)
+
+
+def _write_rows(world: World, rows_of: Callable[[World], Rows], folder: Path) -> int:
+    """Write the rows of a world, unless it has a file; return how many."""
+    file = _file_of(world, folder)
+    if file.exists():
+        return 0
+
+    with warnings.catch_warnings(), threadpool_limits(1):
+        warnings.simplefilter("ignore")  # of risk, and of bounds without contact
+        rows = pd.DataFrame(rows_of(world)).round(_DECIMALS)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(file, rows.to_csv(index=False))
+    return len(rows)
+
+
+def _file_of(world: World, folder: Path) -> Path:
+    return folder / f"{world.name}.csv"
 
 
 def run_worlds(

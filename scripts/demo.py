@@ -107,8 +107,8 @@ def draw_trust(
 ) -> None:
     """Draw trust map and path before the first and after the last mission, on one scale."""
     workspace = result.workspace
-    maps = [result.history["trust_map"].sel(iteration=1), result.trust_map]
-    maps = [values.copy() for values in maps]
+    before, after = result.history["trust_map"].sel(iteration=1), result.trust_map
+    maps = [before.copy(), after.copy()]
     for values in maps:
         values[START] = np.nan  # the trust at the start is assumed
     low, _ = limits_of(np.stack(maps), is_trust=True)

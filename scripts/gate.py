@@ -15,8 +15,7 @@ command does not call does not count, and neither do comments, docstrings and la
 Entries must cover all files in `FILES`, and all tables of results in README and docs, which are the
 Markdown tables with a right-aligned column. `docs/terrain.md#size` stands for all tables of a
 section, and `docs/terrain.md#size: cells` for those whose first column with a title has this title.
-The pages of the evidence are left out, as `benchmarks/tables.py` writes them from
-stored files.
+The pages of the evidence are left out, as `benchmarks/tables.py` writes them from stored files.
 """
 
 import argparse
@@ -129,8 +128,10 @@ def tables_of(page: str, text: str) -> Iterator[str]:
 
 
 def covers(shown: str, result: str) -> bool:
-    """Return whether an item of an entry stands for a result."""
-    return fnmatch(result, shown) or result.startswith(f"{shown}: ")
+    """Return whether an item of an entry stands for a result; files may be a pattern."""
+    if "#" in shown:  # a section or table of a page, whose title may have brackets
+        return result == shown or result.startswith(f"{shown}: ")
+    return fnmatch(result, shown)
 
 
 def why_stale(root: Path, entry: Entry) -> str:

@@ -174,6 +174,13 @@ def test_an_entry_may_stand_for_all_files_of_a_kind(repository):
     assert list(gate.faults(repository)) == []
 
 
+def test_titles_with_brackets_name_their_tables():
+    """Brackets have a meaning in patterns of files."""
+    result = "README.md#results: difference [95 %]"
+    assert gate.covers(result, result)
+    assert not gate.covers(result, "README.md#results: difference 9")
+
+
 def test_results_whose_code_was_never_recorded_are_listed(repository):
     write(repository, gate.MANIFEST, MANIFEST)
     [fault] = gate.faults(repository)

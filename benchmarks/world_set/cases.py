@@ -223,3 +223,8 @@ def worlds(data: FilePath | None = None) -> dict[str, World]:
     """
     folder = None if data is None else str(data)
     return {world.name: replace(world, data=folder) for world in _all()}
+
+
+def available(data: FilePath | None = None) -> dict[str, World]:
+    """Return the worlds whose terrains are available: all with `data`, else those packaged."""
+    return {name: world for name, world in worlds(data).items() if data or world.is_packaged}

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy import ndimage
 
 from trustbo import terrain
-from trustbo.data import Cell
+from trustbo.data import POST_SETS, Cell
 from trustbo.errors import TrustboError, require_choice
 from trustbo.files import FilePath, to_path
 from trustbo.simulation import KinematicSimulator, RadioSimulator, Truth
@@ -146,6 +146,10 @@ class World:
             radio=False,
         )
         return _workspace(assumed, tuple(sorted(options.items())))
+
+    def campaign_workspace(self) -> Workspace:
+        """Make the assumed workspace with all sets of posts, as campaigns have them by default."""
+        return self.workspace(n_posts=len(POST_SETS))
 
     def true_workspace(self) -> Workspace:
         """Make the workspace that a mission planner with a perfect map and team would have."""

@@ -94,3 +94,9 @@ def test_a_page_that_differs_from_its_rows_is_listed(rows, tmp_path, monkeypatch
 
 def test_the_pages_of_the_documentation_are_those_of_their_rows():
     assert tables.stale() == []
+
+
+def test_a_group_that_does_not_exist_is_not_a_number_that_is_missing(rows):
+    assert tables.filled("{{ mean | one | limit too low | trustbo }}") == tables.MISSING
+    with pytest.raises(ValueError, match="limit too wide"):
+        tables.filled("{{ mean | one | limit too wide | trustbo }}")
